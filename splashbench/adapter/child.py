@@ -1,0 +1,198 @@
+"""The child process in which a method runs: `python -m splashbench.adapter.child REQUEST`.
+
+This is the harness's code around the method's: it holds the clock, checks every render, and writes what came out.
+Fitting and rendering are two processes, so a model that renders only in the memory that fitted it is found out.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from splashbench.adapter.contract import Fitted, Method, Render, Run
+from splashbench.adapter.discovery import load_method
+from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
+from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.files import read_model, write_model
+from splashbench.scene import Camera, Particles, Scene, TrainingScene
+from splashbench.submission import Status, to_8bit, write_view
+
+WARM_UP_FRAMES = 10
+
+
+class Failure(Exception):
+    """A phase that ended with a status of its own."""
+
+    def __init__(self, status: Status, reason: str) -> None:
+        super().__init__(reason)
+        self.status, self.reason = status, reason
+
+
+def main(request_path: str) -> int:
+    """Carry out the request; always leaves an Outcome behind unless the process dies."""
+    request = read_model(Path(request_path), Request)
+    phase: Callable[[Request, Method, TrainingScene], Outcome] = _fit if request.phase == "fit" else _render
+    try:
+        method = load_method(request.method)
+        outcome = phase(request, method, Scene.open(Path(request.scene)).training())
+    except Failure as failure:
+        outcome = Outcome(status=failure.status, reason=failure.reason)
+    except MemoryError as error:
+        outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=f"out of memory {error}".strip())
+    except DiskFullError as error:
+        # Not the method's failure: the parent reads this last line and tells the user.
+        print(error, file=sys.stderr)
+        return DISK_FULL_EXIT
+    except Exception as error:
+        if "out of memory" in str(error).lower():
+            outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=_one_line(error))
+        else:
+            import traceback
+
+            traceback.print_exc()
+            outcome = Outcome(status=Status.CRASHED, reason=_one_line(error))
+    write_model(Path(request.result), outcome)
+    return 0
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())[:300]
+    return text if isinstance(error, SplashbenchError) else f"{type(error).__name__}: {text}"
+
+
+def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
+    config = method.Config.preset(request.preset, request.overrides)
+    support = method.supports(scene)
+    if not support.ok:
+        raise Failure(Status.UNSUPPORTED, support.reason or "the method gave no reason")
+    with Path(request.progress).open("a", encoding="utf-8") as stream:
+        run = Run(
+            seed=request.seed,
+            device=request.device,
+            directory=Path(request.scratch),
+            budget_seconds=request.budget_seconds,
+            _report=_reporter(stream),
+        )
+        start = time.perf_counter()
+        fitted = method.fit(scene, config, run)
+        _synchronise()
+        seconds = time.perf_counter() - start
+    fitted.save(Path(request.model))
+    return Outcome(seconds=seconds, settings=config.model_dump(mode="json"), peak_device_memory_bytes=_device_peak())
+
+
+def _reporter(stream: TextIO) -> Callable[[float, str], None]:
+    def report(fraction: float, message: str) -> None:
+        stream.write(f"{fraction:.4f} {' '.join(message.split())}\n")
+        stream.flush()
+
+    return report
+
+
+def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
+    fitted = method.load(Path(request.model), scene)
+    output = Path(request.output)
+    views = [(camera, t) for camera in scene.test_cameras.values() for t in range(scene.n_frames)]
+    counts = []
+    with Path(request.progress).open("a", encoding="utf-8") as stream:
+        report = _reporter(stream)
+        for i, (camera, t) in enumerate(views):
+            _reset_primitive_counter()
+            render = _checked(fitted.render(camera, float(scene.times[t])), camera, t)
+            counts.append(_primitive_count())
+            write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
+            report((i + 1) / len(views), "rendering the test views")
+    particles = fitted.particles()
+    if particles is not None:
+        if particles.n_frames != scene.n_frames:
+            raise Failure(Status.INCOMPLETE, f"particles cover {particles.n_frames} of {scene.n_frames} timesteps")
+        _check_finite(particles)
+        particles.save(output / "particles.npz")
+    known = [count for count in counts if count is not None]
+    return Outcome(
+        render_fps=_frame_rate(fitted, scene, request.timing_frames),
+        primitives_per_frame=statistics.fmean(known) if known else None,
+        peak_device_memory_bytes=_device_peak(),
+    )
+
+
+def _checked(render: Render, camera: Camera, t: int) -> Render:
+    """`render`, after checking type, size and finiteness."""
+    where = f"camera {camera.name}, timestep {t}"
+    if not isinstance(render, Render):
+        raise Failure(Status.INCOMPLETE, f"{where}: render() returned {type(render).__name__}, not a Render")
+    rgb, alpha = np.asarray(render.rgb), np.asarray(render.alpha)
+    wanted = (camera.height, camera.width)
+    if rgb.shape != (*wanted, 3) or alpha.shape != wanted:
+        raise Failure(
+            Status.WRONG_SIZE, f"{where}: rgb is {rgb.shape} and alpha {alpha.shape}; the view is {wanted} pixels"
+        )
+    if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
+        raise Failure(Status.NOT_FINITE, f"{where}: the render has NaN or infinite pixels")
+    return Render(rgb, alpha)
+
+
+def _check_finite(particles: Particles) -> None:
+    for name in ("positions", "velocities"):
+        values = getattr(particles, name)
+        if values is not None and not np.isfinite(values).all():
+            raise Failure(Status.NOT_FINITE, f"particles: {name} has NaN or infinite entries")
+
+
+def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | None:
+    """Frames per second: median of at least `frames` synchronised renders after a warm-up, without I/O.
+
+    Protocol v1 (docs/protocol.md, cost).
+    """
+    if frames < 1:
+        return None
+    cameras = list(scene.test_cameras.values())
+    seconds = []
+    for i in range(WARM_UP_FRAMES + frames):
+        camera, t = cameras[i % len(cameras)], (i // len(cameras)) % scene.n_frames
+        _synchronise()
+        start = time.perf_counter()
+        fitted.render(camera, float(scene.times[t]))
+        _synchronise()
+        if i >= WARM_UP_FRAMES:
+            seconds.append(time.perf_counter() - start)
+    return 1.0 / max(statistics.median(seconds), 1e-9)
+
+
+def _cuda():
+    """torch.cuda where the method has loaded torch and uses a device; torch is never imported for this alone."""
+    torch = sys.modules.get("torch")
+    return torch.cuda if torch is not None and torch.cuda.is_available() else None
+
+
+def _synchronise() -> None:
+    cuda = _cuda()
+    if cuda is not None:
+        cuda.synchronize()
+
+
+def _device_peak() -> int | None:
+    cuda = _cuda()
+    return int(cuda.max_memory_allocated()) if cuda is not None else None
+
+
+def _reset_primitive_counter() -> None:
+    counters = sys.modules.get("splashbench.render.counters")
+    if counters is not None:
+        counters.reset()
+
+
+def _primitive_count() -> int | None:
+    """Primitives that the shared renderer drew since the last reset, or None for a renderer of the method's own."""
+    counters = sys.modules.get("splashbench.render.counters")
+    return int(counters.total()) if counters is not None and counters.calls() else None
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

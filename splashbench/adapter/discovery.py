@@ -1,0 +1,71 @@
+"""Finding methods: those registered under the entry-point group `splashbench.methods`, and files given by path."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+import sys
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+from splashbench.adapter.contract import Method
+from splashbench.errors import SplashbenchError
+
+GROUP = "splashbench.methods"
+#: Written by the harness itself, since no method sees a test image (adapter/oracle.py).
+ORACLE = "oracle"
+
+
+def registered() -> dict[str, EntryPoint]:
+    """Method id -> entry point, sorted; nothing is imported."""
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+def load_method(name: str) -> Method:
+    """The method registered as `name`, or `FILE.py:CLASS` from a file that is not installed.
+
+    Raises SplashbenchError when there is none of that name or its module cannot be imported.
+    """
+    if ":" in name:
+        return _from_file(name)
+    points = registered()
+    if name not in points:
+        near = difflib.get_close_matches(name, [*points, ORACLE], n=1)
+        hint = f"did you mean {near[0]!r}?" if near else "see `splashbench methods list`"
+        raise SplashbenchError(f"there is no method {name!r}; {hint}")
+    try:
+        return _checked(points[name].load(), name)
+    except ImportError as error:
+        raise SplashbenchError(f"method {name!r} cannot be imported ({error}); install what it needs") from None
+
+
+def _from_file(name: str) -> Method:
+    file, _, class_name = name.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise SplashbenchError(f"{path} does not exist; a method that is not installed is given as FILE.py:CLASS")
+    module_name = f"splashbench_user_method_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise SplashbenchError(f"{path} is no Python file; a method is given as FILE.py:CLASS")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise SplashbenchError(f"{path} cannot be imported ({type(error).__name__}: {error}); mend it") from None
+    if not hasattr(module, class_name):
+        raise SplashbenchError(f"{path} has no class {class_name!r}; name the method's class after the colon")
+    return _checked(getattr(module, class_name), name)
+
+
+def _checked(method_class: type, name: str) -> Method:
+    if not (isinstance(method_class, type) and issubclass(method_class, Method)):
+        raise SplashbenchError(f"{name!r} is not a splashbench.adapter.contract.Method; subclass it")
+    missing = sorted(getattr(method_class, "__abstractmethods__", ()))
+    for attribute in ("id", "title"):
+        if not hasattr(method_class, attribute):
+            missing.append(attribute)
+    if missing:
+        raise SplashbenchError(f"method {name!r} lacks {', '.join(missing)}; see CONTRIBUTING.md")
+    return method_class()

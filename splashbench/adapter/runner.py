@@ -1,0 +1,216 @@
+"""Running a method on a scene: Scene -> Submission, whatever happens to the method on the way.
+
+Two child processes, fit then render; the scene they see holds no test image. The submission is written whole in
+every case: with renders when the run is `ok`, else with a status and a reason.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from splashbench.adapter import hardware
+from splashbench.adapter.discovery import ORACLE, load_method
+from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
+from splashbench.adapter.process import Watched, run_watched
+from splashbench.adapter.training_view import make_training_view
+from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.files import atomic_directory, read_model, tree_bytes, write_model
+from splashbench.scene import Particles, Scene
+from splashbench.submission import Identity, Record, Status, Submission, seal
+from splashbench.version import __version__
+
+#: Protocol v1: the frame rate is the median of at least this many renders.
+TIMING_FRAMES = 100
+
+
+def run_method(
+    name: str,
+    scene_directory: Path,
+    out: Path,
+    *,
+    preset: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    timeout_seconds: float | None = None,
+    timing_frames: int = TIMING_FRAMES,
+    replace: bool = False,
+    keep_model: bool = True,
+) -> Submission:
+    """Run method `name` on the scene and write the submission `out`.
+
+    Args:
+        preset: a preset of the method; its first one (the default) when None.
+        overrides: single settings on top of the preset.
+        timeout_seconds: limit for the fit, and again for the rendering.
+        timing_frames: renders to time for frames per second; 0 leaves it out.
+        keep_model: keep the fitted model under OUT/model, so that it can be rendered again.
+
+    Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
+    """
+    scene = Scene.open(scene_directory)
+    if name == ORACLE:
+        from splashbench.adapter.oracle import write_oracle
+
+        return write_oracle(scene, out, replace=replace)
+    method = load_method(name)
+    preset = preset or next(iter(method.Config.presets))
+    config = method.Config.preset(preset, overrides)
+    identity = Identity(
+        method=method.id,
+        method_version=method.version,
+        preset=preset,
+        settings=without_nulls(config.model_dump(mode="json")),
+        seed=seed,
+        scene=scene.name,
+        scene_digest=scene.digest,
+        control=method.control,
+        mixed=method.mixed,
+        splashbench_version=__version__,
+        hardware=hardware.describe(),
+    )
+    with atomic_directory(out, replace=replace) as staging, tempfile.TemporaryDirectory() as scratch:
+        record = _run_phases(
+            Path(scratch),
+            staging,
+            Request(
+                phase="fit",
+                method=name,
+                scene=str(make_training_view(scene, Path(scratch, "scene"))),
+                preset=preset,
+                overrides=dict(overrides or {}),
+                seed=seed,
+                device=device,
+                budget_seconds=timeout_seconds,
+                scratch=str(_made(Path(scratch, "scratch"))),
+                model=str(_made(staging / "model")),
+                output=str(staging),
+                result=str(Path(scratch, "outcome.json")),
+                progress=str(Path(scratch, "progress")),
+                timing_frames=timing_frames,
+            ),
+        )
+        if not keep_model or record.status != Status.OK:
+            _remove_tree(staging / "model")
+        if record.status != Status.OK:
+            for name_ in ("renders", "alpha"):
+                _remove_tree(staging / name_)
+            (staging / "particles.npz").unlink(missing_ok=True)
+        seal(staging, identity, record)
+    return Submission.open(out)
+
+
+def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
+    record = Record()
+    peak = 0
+    device_peak: int | None = None
+    for phase in ("fit", "render"):
+        label = f"{request.method.rpartition('/')[2][:24]}: {phase}"
+        outcome, watched = _run_phase(scratch, request.model_copy(update={"phase": phase}), label)
+        peak = max(peak, watched.peak_memory_bytes)
+        if outcome.peak_device_memory_bytes is not None:
+            device_peak = max(device_peak or 0, outcome.peak_device_memory_bytes)
+        record = record.model_copy(update={"peak_memory_bytes": peak, "peak_device_memory_bytes": device_peak})
+        if outcome.status != Status.OK:
+            return record.model_copy(
+                update={"status": outcome.status, "reason": outcome.reason, "log_tail": watched.log_tail}
+            )
+        if phase == "fit":
+            static = tree_bytes(Path(request.model, "static"))
+            storage = tree_bytes(Path(request.model))
+            record = record.model_copy(
+                update={
+                    "fit_seconds": outcome.seconds,
+                    "storage_bytes": storage,
+                    "dynamic_bytes": storage - static,
+                }
+            )
+    carriers = None
+    if (staging / "particles.npz").is_file():
+        carriers = float(Particles.load(staging / "particles.npz").active.sum(axis=1).mean())
+    return record.model_copy(
+        update={
+            "render_fps": outcome.render_fps,
+            "primitives_per_frame": outcome.primitives_per_frame,
+            "carriers_per_frame": carriers,
+        }
+    )
+
+
+def _run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Watched]:
+    path, result, progress = scratch / "request.json", Path(request.result), Path(request.progress)
+    for stale in (result, progress):
+        stale.unlink(missing_ok=True)
+    write_model(path, request)
+    watched = run_watched(
+        ["-m", "splashbench.adapter.child", str(path)],
+        log=scratch / "log",
+        progress=progress,
+        label=label,
+        timeout_seconds=request.budget_seconds,
+    )
+    if watched.exit_code == DISK_FULL_EXIT:
+        raise DiskFullError(watched.log_tail[-1] if watched.log_tail else "the disk is full; free some space")
+    if watched.timed_out:
+        outcome = Outcome(status=Status.TIMEOUT, reason=f"the {request.phase} took over {request.budget_seconds:g} s")
+    elif result.is_file() and watched.exit_code == 0:
+        outcome = read_model(result, Outcome)
+    elif watched.exit_code == -9:
+        outcome = Outcome(
+            status=Status.OUT_OF_MEMORY, reason=f"the {request.phase} was killed (signal 9), as when memory runs out"
+        )
+    else:
+        last = watched.log_tail[-1] if watched.log_tail else "it said nothing"
+        outcome = Outcome(
+            status=Status.CRASHED, reason=f"the {request.phase} ended with exit code {watched.exit_code}: {last}"
+        )
+    return outcome, watched
+
+
+def without_nulls(settings: dict[str, Any]) -> dict[str, Any]:
+    """`settings` without null values: TOML has no null, and an absent key says the same."""
+    cleaned = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            value = without_nulls(value)
+        if value is not None:
+            cleaned[key] = value
+    return cleaned
+
+
+def _made(path: Path) -> Path:
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _remove_tree(path: Path) -> None:
+    import shutil
+
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def parse_overrides(pairs: list[str]) -> dict[str, Any]:
+    """`["iterations=500", "losses.separation=0"]` -> settings; values are JSON where they parse, else text.
+
+    A dotted key reaches into a nested model.
+    """
+    import json
+
+    settings: dict[str, Any] = {}
+    for pair in pairs:
+        key, separator, text = pair.partition("=")
+        if not separator or not key:
+            raise SplashbenchError(f"--set {pair!r} is not KEY=VALUE; see `splashbench methods show METHOD`")
+        try:
+            value = json.loads(text)
+        except json.JSONDecodeError:
+            value = text
+        *parents, leaf = key.split(".")
+        node = settings
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[leaf] = value
+    return settings

@@ -1,0 +1,44 @@
+"""`splashbench check SUBMISSION`: every fault of a submission at once."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splashbench.cli.output import add_json, emit, say
+
+_EPILOG = """\
+example:
+  splashbench check submissions/bowl_001/splashsplat --scene scenes/bowl_001
+"""
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = subparsers.add_parser(
+        "check",
+        help="look a submission over",
+        description="List every fault of SUBMISSION: changed or missing files, wrong sizes, missing frames.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("submission", type=Path, help="folder of the submission")
+    parser.add_argument("--scene", type=Path, help="the scene it was made for: sizes and frames are checked against it")
+    add_json(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench check`."""
+    from splashbench.scene import Scene
+    from splashbench.submission import check_submission
+
+    scene = Scene.open(arguments.scene) if arguments.scene else None
+    faults = check_submission(arguments.submission, scene)
+    if arguments.json:
+        emit({"submission": str(arguments.submission), "ok": not faults, "faults": faults})
+    for fault in faults:
+        say(f"error: {fault}")
+    if not faults:
+        say(f"{arguments.submission}: no fault found")
+    return 1 if faults else 0

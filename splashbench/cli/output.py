@@ -1,0 +1,35 @@
+"""What every command shares: printing for people on standard error, one JSON object on standard output."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+JSON_HELP = "print one JSON object on standard output (everything for people goes to standard error)"
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add the `--json` flag."""
+    parser.add_argument("--json", action="store_true", help=JSON_HELP)
+
+
+def say(text: str = "") -> None:
+    """Tell a person, on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def emit(data: dict[str, Any]) -> None:
+    """The one JSON object of a command run with `--json`."""
+    print(json.dumps(data, indent=1, allow_nan=False))
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """Plain text columns, the first left-aligned and the others right-aligned."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = []
+    for row in [header, *rows]:
+        cells = [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:]))]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

@@ -1,0 +1,75 @@
+"""`splashbench run METHOD SCENE OUT`: reconstruct a scene with any method, measured by the harness."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splashbench.cli.output import add_json, emit, say
+
+_EPILOG = """\
+examples:
+  splashbench run splashsplat scenes/bowl_001 submissions/bowl_001/splashsplat
+  splashbench run splashsplat SCENE OUT --preset quick --seed 1 --set iterations=500
+  splashbench run nothing SCENE OUT                 the frozen background alone, the reference for dPSNR
+  splashbench run oracle SCENE OUT                  the ground truth itself, a check of the scoring
+  splashbench run my_method.py:MyMethod SCENE OUT   a method that is not installed (CONTRIBUTING.md)
+
+A method that crashes, hangs, runs out of memory or returns NaN gives a submission with that status, and exit status 1.
+"""
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = subparsers.add_parser(
+        "run",
+        help="reconstruct a scene with a method",
+        description="Run METHOD on SCENE in a process of its own and write the submission OUT.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("method", help="a name from `splashbench methods list`, `oracle`, or FILE.py:CLASS")
+    parser.add_argument("scene", type=Path, help="folder of the scene")
+    parser.add_argument("out", type=Path, help="folder of the submission, made by the run")
+    parser.add_argument("--preset", help="settings by name; see `splashbench methods show METHOD`")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+    parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (default 0)")
+    parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can")
+    parser.add_argument("--timeout", type=float, metavar="SECONDS", help="limit for the fit, and for the rendering")
+    parser.add_argument(
+        "--timing-frames", type=int, default=None, metavar="N", help="frames timed for FPS (default 100; 0: none)"
+    )
+    parser.add_argument("--no-model", action="store_true", help="do not keep the fitted model under OUT/model")
+    parser.add_argument("--replace", action="store_true", help="replace OUT when it exists")
+    add_json(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench run`."""
+    from splashbench.adapter.runner import TIMING_FRAMES, parse_overrides, run_method
+
+    submission = run_method(
+        arguments.method,
+        arguments.scene,
+        arguments.out,
+        preset=arguments.preset,
+        overrides=parse_overrides(arguments.overrides),
+        seed=arguments.seed,
+        device=arguments.device,
+        timeout_seconds=arguments.timeout,
+        timing_frames=TIMING_FRAMES if arguments.timing_frames is None else arguments.timing_frames,
+        keep_model=not arguments.no_model,
+        replace=arguments.replace,
+    )
+    record = submission.record
+    if arguments.json:
+        emit(submission.identity.model_dump(mode="json") | record.model_dump(mode="json"))
+    if record.status.value != "ok":
+        say(
+            f"error: {submission.identity.method}: {record.status.value}: {record.reason}; see {arguments.out}/record.json"
+        )
+        return 1
+    cost = f", fit in {record.fit_seconds:.1f} s" if record.fit_seconds is not None else ""
+    say(f"{submission.identity.method}: ok{cost}; submission in {arguments.out}")
+    return 0

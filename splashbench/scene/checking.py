@@ -1,0 +1,69 @@
+"""Looking a whole scene over: every fault at once, for `splashbench scene check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from splashbench.errors import SplashbenchError
+from splashbench.progress import track
+from splashbench.scene.scene import Scene
+
+
+def check_scene(directory: Path) -> list[str]:
+    """All faults of the scene in `directory`, a line each; an empty list means that everything reads."""
+    try:
+        scene = Scene.open(directory)
+    except SplashbenchError as error:
+        return [str(error)]
+    faults: list[str] = []
+    empty = dict.fromkeys(scene.cameras, 0)
+    pairs = [(camera, t) for camera in scene.cameras for t in range(scene.n_frames)]
+    for camera, t in track(pairs, "checking the scene"):
+        for read in (scene.image, scene.mask):
+            try:
+                array = read(camera, t)
+            except SplashbenchError as error:
+                faults.append(str(error))
+                continue
+            empty[camera] += int(read == scene.mask and not array.any())
+    for camera, count in empty.items():
+        if count == scene.n_frames:
+            faults.append(f"{scene.directory / 'seg' / camera}: every mask is empty; the camera shows no liquid")
+    for optional in (scene.initial_points, scene.truth_particles):
+        try:
+            optional()
+        except SplashbenchError as error:
+            faults.append(str(error))
+    for camera in scene.cameras:
+        try:
+            scene.container_mask(camera)
+        except SplashbenchError as error:
+            faults.append(str(error))
+    return faults
+
+
+def describe_scene(scene: Scene) -> dict:
+    """What `splashbench scene info` tells: sizes, split, times and what is known and unknown."""
+    coverage = {
+        camera: float(np.mean([scene.mask(camera, t).mean() for t in range(0, scene.n_frames, 5)]))
+        for camera in scene.cameras
+    }
+    points = scene.initial_points()
+    return {
+        "name": scene.name,
+        "frames": scene.n_frames,
+        "interval_seconds": float(scene.times[-1] - scene.times[0]),
+        "times_source": scene.times_source,
+        "train": list(scene.train),
+        "test": list(scene.test),
+        "sizes": {name: [camera.width, camera.height] for name, camera in scene.cameras.items()},
+        "mask_coverage": {camera: round(value, 5) for camera, value in coverage.items()},
+        "gravity": scene.gravity.tolist() if scene.gravity is not None else None,
+        "metres_per_unit": scene.metres_per_unit,
+        "initial_points": 0 if points is None else len(points),
+        "truth_particles": (scene.directory / "truth" / "particles.npz").is_file(),
+        "released": scene.is_released,
+        "digest": scene.digest,
+    }

@@ -1,0 +1,64 @@
+"""Particles over time: a method's carriers, or the ground truth of a made-up scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import atomic_path, read_npz
+
+
+@dataclass
+class Particles:
+    """Positions of N particles at T instants; a row is one particle followed through time.
+
+    Attributes:
+        positions: [T, N, 3] float32, scene units; entries of inactive particles are finite but meaningless.
+        active: [T, N] bool, whether the particle exists at that instant.
+        velocities: [T, N, 3] float32, scene units per second, or None where they are not known.
+    """
+
+    positions: NDArray[np.float32]
+    active: NDArray[np.bool_]
+    velocities: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        self.positions = np.asarray(self.positions, dtype=np.float32)
+        self.active = np.asarray(self.active, dtype=bool)
+        shape = self.positions.shape
+        if len(shape) != 3 or shape[2] != 3 or self.active.shape != shape[:2]:
+            raise ValueError(f"positions {shape} and active {self.active.shape} must be [T, N, 3] and [T, N]")
+        if self.velocities is not None:
+            self.velocities = np.asarray(self.velocities, dtype=np.float32)
+            if self.velocities.shape != shape:
+                raise ValueError(f"velocities {self.velocities.shape} must be shaped like positions {shape}")
+
+    @property
+    def n_frames(self) -> int:
+        """T, the number of instants."""
+        return self.positions.shape[0]
+
+    def at(self, t: int) -> NDArray[np.float32]:
+        """Positions [n, 3] of the particles that exist at instant `t`."""
+        return self.positions[t][self.active[t]]
+
+    def save(self, path: Path) -> None:
+        """Write an .npz without pickles, whole or not at all."""
+        arrays: dict[str, NDArray] = {"positions": self.positions, "active": self.active}
+        if self.velocities is not None:
+            arrays["velocities"] = self.velocities
+        with atomic_path(path) as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Particles:
+        """Read what `save` wrote, or a stranger's file of that layout; one-line errors name the file."""
+        arrays = read_npz(path, {"positions": 3, "active": 2}, optional={"velocities": 3})
+        try:
+            return cls(arrays["positions"], arrays["active"], arrays.get("velocities"))
+        except ValueError as error:
+            raise SplashbenchError(f"{path}: {error}; write it again") from None

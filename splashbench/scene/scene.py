@@ -1,0 +1,235 @@
+"""A scene: synchronised images and liquid masks of calibrated, fixed cameras, with a training and a test split.
+
+`Scene.open` reads the released layout, with or without scene.json (docs/scene_format.md). Images are read when
+asked for, never all at once. `TrainingScene` is what a method sees: training views, and of test views the poses.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import image_size, read_gray, read_image, read_model, read_npz, sha256_file
+from splashbench.scene.camera import Camera
+from splashbench.scene.layout import SceneMeta, SplitFile
+from splashbench.scene.particles import Particles
+
+# Without timestamps a scene still has an order; metrics that need seconds look at `times_source`.
+NOMINAL_STEP_SECONDS = 1 / 30
+
+
+class Scene:
+    """A scene on disk. Use `Scene.open`.
+
+    Attributes:
+        directory, name: where it lies and what it is called.
+        cameras: name -> Camera, training cameras first.
+        train, test: camera names of the split.
+        frames: file stems of the timesteps, such as "000000".
+        times: [T] seconds; times_source says whether they come from "scene.json", the "manifest" or are "nominal".
+        camera_times: camera name -> [T] seconds, each camera's own where known, else `times`.
+        gravity: unit vector [3] along which things fall, or None. metres_per_unit: metric scale, or None.
+        is_released: whether this is one of the 20 released scenes, in the release's units.
+    """
+
+    def __init__(self, directory: Path, train: SplitFile, test: SplitFile, meta: SceneMeta | None) -> None:
+        self.directory = Path(directory)
+        self.name = meta.name if meta else self.directory.resolve().name
+        self.meta = meta
+        self.train, self.test = train.names, test.names
+        if train.n_frames != test.n_frames:
+            raise SplashbenchError(
+                f"{directory}: train_meta.json has {train.n_frames} frames and test_meta.json {test.n_frames}; "
+                "both splits must cover the same timesteps"
+            )
+        shared = set(train.names) & set(test.names)
+        if shared:
+            raise SplashbenchError(
+                f"{directory}: camera {min(shared)} is in train_meta.json and test_meta.json; keep it in one"
+            )
+        self._paths = train.paths | test.paths
+        self.frames = tuple(Path(path).stem for path in train.paths[train.names[0]])
+        self.n_frames = len(self.frames)
+        self.cameras: dict[str, Camera] = {}
+        for split in (train, test):
+            for c, name in enumerate(split.names):
+                width, height = self._size(name)
+                try:
+                    self.cameras[name] = Camera(name, width, height, split.K[c], split.w2c[c])
+                except ValueError as error:
+                    raise SplashbenchError(f"{directory}: {error}; mend the calibration") from None
+        self._set_times()
+        self.gravity = np.array(meta.gravity) if meta and meta.gravity else None
+        self.metres_per_unit = meta.metres_per_unit if meta else None
+
+    @classmethod
+    def open(cls, directory: Path) -> Scene:
+        """Read the scene in `directory`. Raises SplashbenchError naming the first file at fault."""
+        directory = Path(directory)
+        if not directory.is_dir():
+            raise SplashbenchError(f"{directory} is not a folder; give the folder of a scene")
+        for name in ("train_meta.json", "test_meta.json"):
+            if not (directory / name).is_file():
+                raise SplashbenchError(f"{directory / name} is missing; a scene has train_meta.json and test_meta.json")
+        meta_path = directory / "scene.json"
+        meta = read_model(meta_path, SceneMeta) if meta_path.is_file() else None
+        return cls(directory, SplitFile(directory / "train_meta.json"), SplitFile(directory / "test_meta.json"), meta)
+
+    def _size(self, camera: str) -> tuple[int, int]:
+        if self.meta and self.meta.sizes and camera in self.meta.sizes:
+            return self.meta.sizes[camera]
+        return image_size(self.image_path(camera, 0))
+
+    def _set_times(self) -> None:
+        from splashbench_data_manifest import load_scenes
+
+        facts = load_scenes().get(self.name)
+        self.is_released = facts is not None and self.meta is None
+        if self.meta and self.meta.times is not None:
+            self.times = self._checked_times("times", self.meta.times)
+            self.times_source = "scene.json"
+        elif facts is not None:
+            self.times = np.asarray(facts.times(self.n_frames), dtype=np.float64)
+            self.times_source = "manifest"
+        else:
+            self.times = np.arange(self.n_frames) * NOMINAL_STEP_SECONDS
+            self.times_source = "nominal"
+        own = (self.meta.camera_times if self.meta else None) or {}
+        self.camera_times = {
+            name: self._checked_times(f"camera_times of {name}", own[name]) if name in own else self.times
+            for name in self.cameras
+        }
+
+    def _checked_times(self, what: str, values: list[float]) -> NDArray[np.float64]:
+        if len(values) != self.n_frames:
+            raise SplashbenchError(
+                f"{self.directory / 'scene.json'}: {what} has {len(values)} entries for {self.n_frames} frames; "
+                "give one time per frame"
+            )
+        return np.asarray(values, dtype=np.float64)
+
+    def image_path(self, camera: str, t: int) -> Path:
+        """The image file of `camera` at timestep `t`."""
+        return self.directory / "ims" / self._paths[camera][t]
+
+    def mask_path(self, camera: str, t: int) -> Path:
+        """The liquid mask file of `camera` at timestep `t`."""
+        return self.directory / "seg" / Path(self._paths[camera][t]).with_suffix(".png")
+
+    def image(self, camera: str, t: int) -> NDArray[np.uint8]:
+        """sRGB uint8 [H, W, 3] of `camera` at timestep `t`."""
+        return self._sized(camera, self.image_path(camera, t), read_image(self.image_path(camera, t)))
+
+    def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
+        """Liquid mask [H, W] of `camera` at timestep `t`."""
+        return self._sized(camera, self.mask_path(camera, t), read_gray(self.mask_path(camera, t))) > 127
+
+    def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
+        """Container mask [H, W] of `camera`, or None where the scene has none."""
+        path = self.directory / "container_mask" / f"{camera}.png"
+        return self._sized(camera, path, read_gray(path)) > 127 if path.is_file() else None
+
+    def _sized(self, camera: str, path: Path, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        view = self.cameras[camera]
+        if array.shape[:2] != (view.height, view.width):
+            raise SplashbenchError(
+                f"{path} is {array.shape[1]}x{array.shape[0]}, but camera {camera}'s images are "
+                f"{view.width}x{view.height}; bring the file to that size"
+            )
+        return array
+
+    def initial_points(self) -> NDArray[np.float32] | None:
+        """Static points [N, 7] as x, y, z (scene units), r, g, b in [0, 1], segment; None where there are none."""
+        path = self.directory / "init_pt_cld.npz"
+        if not path.is_file():
+            return None
+        data = read_npz(path, {"data": 2})["data"]
+        if data.shape[1] < 6:
+            raise SplashbenchError(f"{path}: data has {data.shape[1]} columns, not x y z r g b seg; write it again")
+        segment = data[:, 6:7] if data.shape[1] > 6 else np.zeros((len(data), 1))
+        return np.concatenate([data[:, :6], segment], axis=1).astype(np.float32)
+
+    def truth_particles(self) -> Particles | None:
+        """The true particles of a made-up scene, on the scene's timesteps, or None."""
+        path = self.directory / "truth" / "particles.npz"
+        if not path.is_file():
+            return None
+        particles = Particles.load(path)
+        if particles.n_frames != self.n_frames:
+            raise SplashbenchError(
+                f"{path} has {particles.n_frames} instants, the scene {self.n_frames}; attach it again"
+            )
+        return particles
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over calibration, times and every image and mask: two scenes with one digest score alike.
+
+        Ground-truth particles are left out, so that attaching them does not orphan earlier submissions.
+        """
+        digest = hashlib.sha256()
+        names = ["train_meta.json", "test_meta.json", "scene.json"]
+        files = [self.directory / name for name in names if (self.directory / name).is_file()]
+        for camera in sorted(self.cameras):
+            for t in range(self.n_frames):
+                files += [self.image_path(camera, t), self.mask_path(camera, t)]
+        for path in files:
+            if not path.is_file():
+                raise SplashbenchError(f"{path} is missing; restore it, or leave its frame out of the *_meta.json")
+            entry = [path.relative_to(self.directory).as_posix(), sha256_file(path)]
+            digest.update(json.dumps(entry).encode())
+        return digest.hexdigest()
+
+    def training(self) -> TrainingScene:
+        """This scene as a method may see it."""
+        return TrainingScene(self)
+
+
+class TrainingScene:
+    """A scene as a method sees it: images and masks of training views; of test views only pose, size and times.
+
+    Attributes are those of `Scene`; `cameras` holds the training cameras, `test_cameras` the test ones.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self.name, self.directory = scene.name, scene.directory
+        self.train, self.test = scene.train, scene.test
+        self.cameras = {name: scene.cameras[name] for name in scene.train}
+        self.test_cameras = {name: scene.cameras[name] for name in scene.test}
+        self.frames, self.n_frames = scene.frames, scene.n_frames
+        self.times, self.times_source, self.camera_times = scene.times, scene.times_source, scene.camera_times
+        self.gravity, self.metres_per_unit, self.is_released = (
+            scene.gravity,
+            scene.metres_per_unit,
+            scene.is_released,
+        )
+
+    def _training_only(self, camera: str) -> None:
+        if camera not in self.cameras:
+            raise SplashbenchError(f"camera {camera} of {self.name} is no training view; methods may not read it")
+
+    def image(self, camera: str, t: int) -> NDArray[np.uint8]:
+        """sRGB uint8 [H, W, 3] of a training camera at timestep `t`."""
+        self._training_only(camera)
+        return self._scene.image(camera, t)
+
+    def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
+        """Liquid mask [H, W] of a training camera at timestep `t`."""
+        self._training_only(camera)
+        return self._scene.mask(camera, t)
+
+    def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
+        """Container mask [H, W] of a training camera, or None."""
+        self._training_only(camera)
+        return self._scene.container_mask(camera)
+
+    def initial_points(self) -> NDArray[np.float32] | None:
+        """Static points [N, 7], see `Scene.initial_points`."""
+        return self._scene.initial_points()

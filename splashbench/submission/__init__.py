@@ -1,0 +1,16 @@
+"""Submissions: what a method hands in. Writing, reading and checking them."""
+
+from splashbench.submission.identity import PROTOCOL, Identity, Record, Status
+from splashbench.submission.submission import Submission, check_submission, seal, to_8bit, write_view
+
+__all__ = [
+    "PROTOCOL",
+    "Identity",
+    "Record",
+    "Status",
+    "Submission",
+    "check_submission",
+    "seal",
+    "to_8bit",
+    "write_view",
+]

@@ -1,0 +1,63 @@
+"""What a submission says of itself: submission.toml (identity) and record.json (the harness's measurements)."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+PROTOCOL = "v1"
+_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
+
+
+class Status(str, Enum):
+    """How a run ended. Only `ok` is scored; everything else is kept, shown and never dropped."""
+
+    OK = "ok"
+    UNSUPPORTED = "unsupported"
+    CRASHED = "crashed"
+    TIMEOUT = "timeout"
+    OUT_OF_MEMORY = "out_of_memory"
+    NOT_FINITE = "not_finite"
+    WRONG_SIZE = "wrong_size"
+    INCOMPLETE = "incomplete"
+
+
+class Identity(BaseModel):
+    """submission.toml. Identity is in here and never in a file name."""
+
+    model_config = ConfigDict(extra="forbid")
+    schema_version: Literal[1] = 1
+    protocol: Literal["v1"] = PROTOCOL
+    method: str = Field(pattern=_NAME)
+    method_version: str = "1"
+    preset: str = "best"
+    settings: dict[str, Any] = Field(default_factory=dict)
+    seed: int = 0
+    scene: str
+    scene_digest: str = Field(pattern=r"^[0-9a-f]{64}$")
+    control: bool = False
+    mixed: bool = False
+    splashbench_version: str = ""
+    hardware: dict[str, Any] = Field(default_factory=dict)
+    #: What the submitter says the figures are; shown beside the verified ones, never instead of them.
+    claimed: dict[str, float] = Field(default_factory=dict)
+
+
+class Record(BaseModel):
+    """record.json: status and costs, as the harness measured them; null is not measured."""
+
+    model_config = ConfigDict(extra="forbid")
+    schema_version: Literal[1] = 1
+    status: Status = Status.OK
+    reason: str = ""
+    fit_seconds: float | None = Field(default=None, ge=0)
+    render_fps: float | None = Field(default=None, ge=0)
+    peak_memory_bytes: int | None = Field(default=None, ge=0)
+    peak_device_memory_bytes: int | None = Field(default=None, ge=0)
+    storage_bytes: int | None = Field(default=None, ge=0)
+    dynamic_bytes: int | None = Field(default=None, ge=0)
+    primitives_per_frame: float | None = Field(default=None, ge=0)
+    carriers_per_frame: float | None = Field(default=None, ge=0)
+    log_tail: list[str] = Field(default_factory=list)

@@ -1,0 +1,182 @@
+"""A submission on disk: what a method hands in, written whole, read only when its digests hold.
+
+submission.toml             identity
+record.json                 status and costs, by the harness
+renders/<cam>/<frame>.png   sRGB, test views       (status ok only)
+alpha/<cam>/<frame>.png     foreground opacity     (status ok only)
+particles.npz               positions [T, N, 3], active [T, N]; optional
+SHA256SUMS                  of every other file
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench import toml
+from splashbench.errors import SplashbenchError
+from splashbench.files import (
+    image_size,
+    read_gray,
+    read_image,
+    read_model,
+    sha256_file,
+    validate_model,
+    write_model,
+    write_png,
+    write_text,
+)
+from splashbench.scene import Particles, Scene
+from splashbench.submission.identity import Identity, Record, Status
+
+SUMS = "SHA256SUMS"
+_MAX_FILES = 200_000
+
+
+def render_path(directory: Path, kind: str, camera: str, t: int) -> Path:
+    """The file of `kind` ("renders" or "alpha") for `camera` at timestep `t`."""
+    return Path(directory) / kind / camera / f"{t:06d}.png"
+
+
+def to_8bit(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Round values in [0, 1] to 8 bits, clipping what lies outside."""
+    return np.round(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def write_view(directory: Path, camera: str, t: int, rgb: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> None:
+    """Write one test view: rgb uint8 [H, W, 3] and foreground opacity uint8 [H, W]."""
+    write_png(render_path(directory, "renders", camera, t), rgb)
+    write_png(render_path(directory, "alpha", camera, t), alpha)
+
+
+def seal(directory: Path, identity: Identity, record: Record) -> None:
+    """Write identity, record and, last, the digests of everything in `directory`."""
+    directory = Path(directory)
+    write_text(directory / "submission.toml", toml.dumps(identity.model_dump(mode="json", exclude_none=True)))
+    write_model(directory / "record.json", record)
+    lines = [f"{sha256_file(directory / name)}  {name}\n" for name in _files(directory)]
+    write_text(directory / SUMS, "".join(lines))
+
+
+def _files(directory: Path) -> list[str]:
+    """Paths of all files but SHA256SUMS, relative, in one order on every machine."""
+    names = []
+    for root, folders, files in os.walk(directory):
+        folders.sort()
+        names += [Path(root, name).relative_to(directory).as_posix() for name in files]
+        if len(names) > _MAX_FILES:
+            raise SplashbenchError(f"{directory} holds more than {_MAX_FILES} files; this is no submission")
+    return sorted(name for name in names if name != SUMS)
+
+
+class Submission:
+    """A verified submission. Use `Submission.open`.
+
+    Attributes: directory; identity (method, preset, seed, scene ...); record (costs); status; reason.
+    """
+
+    def __init__(self, directory: Path, identity: Identity, record: Record) -> None:
+        self.directory, self.identity, self.record = Path(directory), identity, record
+        self.status, self.reason = record.status, record.reason
+
+    @classmethod
+    def open(cls, directory: Path, verify: bool = True) -> Submission:
+        """Read the submission in `directory`; with `verify`, refuse it when a file was changed, added or removed."""
+        directory = Path(directory)
+        if not (directory / "submission.toml").is_file():
+            raise SplashbenchError(f"{directory} is no submission (no submission.toml in it); give a run's folder")
+        if verify:
+            faults = integrity_faults(directory)
+            if faults:
+                more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+                raise SplashbenchError(f"{faults[0]}{more}; the submission is refused: run the method again")
+        path = directory / "submission.toml"
+        identity = validate_model(path, Identity, toml.load(path))
+        return cls(directory, identity, read_model(directory / "record.json", Record))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of SHA256SUMS: names this submission's exact bytes."""
+        return sha256_file(self.directory / SUMS)
+
+    def rendering(self, camera: str, t: int) -> NDArray[np.uint8]:
+        """Rendered sRGB uint8 [H, W, 3] of test view `camera` at timestep `t`."""
+        return read_image(render_path(self.directory, "renders", camera, t))
+
+    def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
+        """Rendered foreground opacity [H, W] in [0, 1] of test view `camera` at timestep `t`."""
+        return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
+
+    def particles(self) -> Particles | None:
+        """The method's particles, or None."""
+        path = self.directory / "particles.npz"
+        return Particles.load(path) if path.is_file() else None
+
+
+def integrity_faults(directory: Path) -> list[str]:
+    """What speaks against the bytes: a line for every file changed, missing, added, or not a plain file."""
+    directory = Path(directory)
+    path = directory / SUMS
+    if not path.is_file():
+        return [f"{path} is missing"]
+    faults: list[str] = []
+    listed: dict[str, str] = {}
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        return [f"{path} cannot be read ({error})"]
+    for line in text.splitlines():
+        digest, separator, name = line.partition("  ")
+        if not separator or len(digest) != 64:
+            return [f"{path}: {line[:60]!r} is not a digest and a file name"]
+        listed[name] = digest
+    for root, folders, files in os.walk(directory):
+        faults += [f"{Path(root, name)} is a link" for name in [*folders, *files] if Path(root, name).is_symlink()]
+    if faults:
+        return faults
+    present = set(_files(directory))
+    faults += [f"{directory / name} is missing" for name in sorted(set(listed) - present)]
+    faults += [f"{directory / name} is not listed in {SUMS}" for name in sorted(present - set(listed))]
+    faults += [
+        f"{directory / name} does not match its digest in {SUMS}"
+        for name in sorted(present & set(listed))
+        if sha256_file(directory / name) != listed[name]
+    ]
+    return faults
+
+
+def check_submission(directory: Path, scene: Scene | None = None) -> list[str]:
+    """Every fault of a submission at once, a line each: bytes, identity, and against `scene` sizes and frames."""
+    directory = Path(directory)
+    try:
+        submission = Submission.open(directory, verify=False)
+    except SplashbenchError as error:
+        return [str(error)]
+    faults = integrity_faults(directory)
+    try:
+        particles = submission.particles()
+    except SplashbenchError as error:
+        faults.append(str(error))
+        particles = None
+    if scene is None or submission.status != Status.OK:
+        return faults
+    if submission.identity.scene_digest != scene.digest:
+        faults.append(f"{directory} was made for another version of scene {submission.identity.scene}")
+    if particles is not None and particles.n_frames != scene.n_frames:
+        faults.append(f"{directory / 'particles.npz'} has {particles.n_frames} instants, the scene {scene.n_frames}")
+    for name in scene.test:
+        camera = scene.cameras[name]
+        for t in range(scene.n_frames):
+            for kind in ("renders", "alpha"):
+                path = render_path(directory, kind, name, t)
+                try:
+                    size = image_size(path)
+                except SplashbenchError as error:
+                    faults.append(str(error))
+                    continue
+                if size != (camera.width, camera.height):
+                    faults.append(f"{path} is {size[0]}x{size[1]}, not {camera.width}x{camera.height}")
+    return faults

@@ -1,0 +1,41 @@
+"""Fixtures that the whole suite shares: a small scene with known truth, and the folder of real test data."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from splashbench.scene import Scene
+from splashbench.synth.balls import write_balls_scene
+
+
+@pytest.fixture(scope="session")
+def balls_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of balls in free flight; read-only, shared by all tests. Use `balls_copy` to change something."""
+    directory = tmp_path_factory.mktemp("scenes") / "balls"
+    write_balls_scene(directory)
+    return directory
+
+
+@pytest.fixture(scope="session")
+def balls(balls_directory: Path) -> Scene:
+    """The shared scene of balls."""
+    return Scene.open(balls_directory)
+
+
+@pytest.fixture
+def balls_copy(balls_directory: Path, tmp_path: Path) -> Path:
+    """A copy of the scene that the test may damage."""
+    return Path(shutil.copytree(balls_directory, tmp_path / "balls"))
+
+
+@pytest.fixture(scope="session")
+def test_data() -> Path:
+    """The folder of real test data; the test skips where it is not at hand."""
+    folder = os.environ.get("SPLASHBENCH_TEST_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("SPLASHBENCH_TEST_DATA is not set to a folder with real test data")
+    return Path(folder)

@@ -1,0 +1,88 @@
+"""Submissions: refused when tampered with, and every fault listed at once."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splashbench.adapter.oracle import write_oracle
+from splashbench.errors import SplashbenchError
+from splashbench.files import write_png
+from splashbench.scene import Scene
+from splashbench.submission import Submission, check_submission, to_8bit
+
+
+@pytest.fixture(scope="module")
+def sealed(balls: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("submission") / "oracle"
+    write_oracle(balls, directory)
+    return directory
+
+
+@pytest.fixture
+def copy(sealed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(sealed, tmp_path / "copy"))
+
+
+def test_a_changed_render_is_refused(copy: Path) -> None:
+    write_png(copy / "renders" / "6" / "000003.png", np.zeros((64, 96, 3), np.uint8))
+    with pytest.raises(SplashbenchError, match=r"renders/6/000003.png does not match .* refused"):
+        Submission.open(copy)
+
+
+def test_changed_costs_are_refused(copy: Path) -> None:
+    path = copy / "record.json"
+    path.write_text(path.read_text().replace('"fit_seconds": null', '"fit_seconds": 0.1'))
+    with pytest.raises(SplashbenchError, match=r"record.json does not match"):
+        Submission.open(copy)
+
+
+def test_added_removed_and_linked_files_are_refused(copy: Path) -> None:
+    (copy / "extra.txt").write_text("more")
+    with pytest.raises(SplashbenchError, match=r"extra.txt is not listed"):
+        Submission.open(copy)
+    (copy / "extra.txt").unlink()
+    target = copy / "alpha" / "7" / "000000.png"
+    target.rename(copy.parent / "elsewhere.png")
+    with pytest.raises(SplashbenchError, match=r"alpha/7/000000.png is missing"):
+        Submission.open(copy)
+    target.symlink_to(copy.parent / "elsewhere.png")
+    with pytest.raises(SplashbenchError, match="is a link"):
+        Submission.open(copy)
+
+
+def test_a_submission_without_digests_is_refused(copy: Path) -> None:
+    (copy / "SHA256SUMS").unlink()
+    with pytest.raises(SplashbenchError, match="SHA256SUMS is missing"):
+        Submission.open(copy)
+
+
+def test_check_lists_every_fault(copy: Path, balls: Scene) -> None:
+    write_png(copy / "renders" / "6" / "000001.png", np.zeros((10, 10, 3), np.uint8))
+    (copy / "alpha" / "7" / "000002.png").unlink()
+    faults = "\n".join(check_submission(copy, balls))
+    assert "renders/6/000001.png does not match its digest" in faults
+    assert "renders/6/000001.png is 10x10, not 96x64" in faults
+    assert "alpha/7/000002.png is missing" in faults
+
+
+def test_check_sees_another_scene(copy: Path, balls_copy: Path) -> None:
+    write_png(balls_copy / "seg" / "1" / "000000.png", np.full((64, 96), 255, np.uint8))
+    faults = check_submission(copy, Scene.open(balls_copy))
+    assert faults == [f"{copy} was made for another version of scene balls"]
+
+
+def test_a_folder_that_is_no_submission_is_told(tmp_path: Path) -> None:
+    assert "no submission" in check_submission(tmp_path)[0]
+
+
+def test_identity_from_a_stranger_is_validated(copy: Path) -> None:
+    path = copy / "submission.toml"
+    path.write_text(path.read_text().replace('method = "oracle"', 'method = "../../etc"'))
+    with pytest.raises(SplashbenchError, match=r"submission.toml: method"):
+        Submission.open(copy, verify=False)
+
+
+def test_eight_bits_round_and_clip() -> None:
+    assert to_8bit(np.array([-0.1, 0.0, 0.5, 1.0, 1.2])).tolist() == [0, 0, 128, 255, 255]

@@ -1,0 +1,128 @@
+"""Files: whole or not at all, and nothing from strangers is trusted."""
+
+import errno
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.files import (
+    atomic_directory,
+    atomic_path,
+    read_gray,
+    read_image,
+    read_json,
+    read_npz,
+    write_image,
+    write_json,
+    write_png,
+)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(ValueError), atomic_path(path) as temporary:
+        temporary.write_text("half")
+        raise ValueError
+    assert read_json(path) == {"a": 1}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_a_failed_directory_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ValueError), atomic_directory(tmp_path / "out") as staging:
+        (staging / "file").write_text("half")
+        raise ValueError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_directory_is_replaced_only_when_asked(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for content in ("first", "second"):
+        with atomic_directory(out, replace=content == "second") as staging:
+            (staging / "file").write_text(content)
+    assert (out / "file").read_text() == "second"
+    with pytest.raises(SplashbenchError, match="exists already"), atomic_directory(out):
+        pass
+    with pytest.raises(ValueError), atomic_directory(out, replace=True) as staging:
+        raise ValueError
+    assert (out / "file").read_text() == "second"
+
+
+def test_a_full_disk_is_one_line_naming_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "big.json"
+    with pytest.raises(DiskFullError, match=r"big.json could not be written: the disk is full"), atomic_path(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_within_an_image_writer_is_told_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path) -> Path:
+        link = tmp_path / f"full-{path.name}"
+        link.symlink_to("/dev/full")
+        return link
+
+    monkeypatch.setattr("splashbench.files._sibling", full)
+    noise = np.random.default_rng(0).integers(0, 255, (300, 300, 3), dtype=np.uint8)
+    for name in ("image.jpg", "image.png"):
+        with pytest.raises(DiskFullError, match=f"{name} could not be written: the disk is full"):
+            write_image(tmp_path / name, noise)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_images_come_back_as_written(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 255, (5, 7, 3), dtype=np.uint8)
+    write_png(tmp_path / "rgb.png", rgb)
+    assert (read_image(tmp_path / "rgb.png") == rgb).all()
+    write_png(tmp_path / "gray.png", rgb[..., 0])
+    assert (read_gray(tmp_path / "gray.png") == rgb[..., 0]).all()
+
+
+def test_a_truncated_image_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cut.png"
+    write_png(path, np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(SplashbenchError, match=r"cut.png is cut short or damaged"):
+        read_image(path)
+
+
+def test_nan_never_reaches_a_json_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "a.json", {"a": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_deep_json_is_refused_not_crashed_on(tmp_path: Path) -> None:
+    path = tmp_path / "deep.json"
+    path.write_text("[" * 200_000)
+    with pytest.raises(SplashbenchError, match=r"deep.json cannot be read"):
+        read_json(path)
+
+
+def test_npz_without_pickles_and_with_the_right_ranks(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, a=np.zeros((2, 3)), b=np.array([object()], dtype=object), c=np.array([np.nan]))
+    assert read_npz(path, {"a": 2})["a"].shape == (2, 3)
+    with pytest.raises(SplashbenchError, match="a has 2 dimensions, not 3"):
+        read_npz(path, {"a": 3})
+    with pytest.raises(SplashbenchError, match="without pickles"):
+        read_npz(path, {"b": 1})
+    with pytest.raises(SplashbenchError, match="NaN"):
+        read_npz(path, {"c": 1})
+    with pytest.raises(SplashbenchError, match="lacks the array 'd'"):
+        read_npz(path, {"d": 1})
+    path.write_bytes(b"PK\x03\x04 nonsense")
+    with pytest.raises(SplashbenchError, match=r"a.npz is not a readable"):
+        read_npz(path, {"a": 2})
+
+
+def test_a_zip_bomb_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", b"\0" * 1_000_000)
+    monkeypatch.setattr("splashbench.files.MAX_NPZ_BYTES", 1000)
+    with pytest.raises(SplashbenchError, match="unpacks to more than"):
+        read_npz(path, {"a": 1})
