@@ -22,6 +22,7 @@ from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import read_model, write_model
 from splashbench.scene import Camera, Particles, Scene, TrainingScene
 from splashbench.submission import Status, to_8bit, write_view
+from splashbench.submission.exr import write_exr
 
 WARM_UP_FRAMES = 10
 
@@ -107,6 +108,8 @@ def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
             render = _checked(fitted.render(camera, float(scene.times[t])), camera, t)
             counts.append(_primitive_count())
             write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
+            if request.exr:
+                write_exr(output / "exr" / camera.name / f"{t:06d}.exr", render.rgb, render.alpha)
             report((i + 1) / len(views), "rendering the test views")
     particles = fitted.particles()
     if particles is not None:

@@ -30,6 +30,7 @@ class Request(BaseModel):
     result: str
     progress: str
     timing_frames: int
+    exr: bool
 
 
 class Outcome(BaseModel):

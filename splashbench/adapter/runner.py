@@ -39,6 +39,7 @@ def run_method(
     timing_frames: int = TIMING_FRAMES,
     replace: bool = False,
     keep_model: bool = True,
+    exr: bool = False,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
 
@@ -48,6 +49,7 @@ def run_method(
         timeout_seconds: limit for the fit, and again for the rendering.
         timing_frames: renders to time for frames per second; 0 leaves it out.
         keep_model: keep the fitted model under OUT/model, so that it can be rendered again.
+        exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
     """
@@ -91,12 +93,13 @@ def run_method(
                 result=str(Path(scratch, "outcome.json")),
                 progress=str(Path(scratch, "progress")),
                 timing_frames=timing_frames,
+                exr=exr,
             ),
         )
         if not keep_model or record.status != Status.OK:
             _remove_tree(staging / "model")
         if record.status != Status.OK:
-            for name_ in ("renders", "alpha"):
+            for name_ in ("renders", "alpha", "exr"):
                 _remove_tree(staging / name_)
             (staging / "particles.npz").unlink(missing_ok=True)
         seal(staging, identity, record)

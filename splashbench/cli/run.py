@@ -39,6 +39,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--timing-frames", type=int, default=None, metavar="N", help="frames timed for FPS (default 100; 0: none)"
     )
+    parser.add_argument("--exr", action="store_true", help="write the renders also as OpenEXR, for compositing")
     parser.add_argument("--no-model", action="store_true", help="do not keep the fitted model under OUT/model")
     parser.add_argument("--replace", action="store_true", help="replace OUT when it exists")
     add_json(parser)
@@ -59,6 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         device=arguments.device,
         timeout_seconds=arguments.timeout,
         timing_frames=TIMING_FRAMES if arguments.timing_frames is None else arguments.timing_frames,
+        exr=arguments.exr,
         keep_model=not arguments.no_model,
         replace=arguments.replace,
     )
