@@ -90,7 +90,8 @@ class Scene:
         from splashbench_data_manifest import load_scenes
 
         facts = load_scenes().get(self.name)
-        self.is_released = facts is not None and self.meta is None
+        # A scene.json that only adds what the release lacks (gravity, say) changes no units; a made one has a maker.
+        self.is_released = facts is not None and not (self.meta and self.meta.provenance)
         if self.meta and self.meta.times is not None:
             self.times = self._checked_times("times", self.meta.times)
             self.times_source = "scene.json"

@@ -1,0 +1,75 @@
+# Everything a newcomer needs, in a virtual environment of its own (.venv). `make` alone lists the targets.
+#
+#   make demo                       make a scene, reconstruct it, score it
+#   make test PYTHON=python3.12     with another interpreter (only read when .venv is made)
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+# A PYTHON that somebody chose is taken at its word; the default gives way to any supported one that is there.
+CANDIDATES := $(if $(filter file,$(origin PYTHON)),python3 python3.13 python3.12 python3.11 python3.10,$(PYTHON))
+SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-all lint wheel clean
+
+help:
+	@echo "make demo      make a small scene, reconstruct it and score it, into demo_output/"
+	@echo "make test      run the tests, the slow ones left out"
+	@echo "make test-all  run every test (those without a CUDA device to run on skip)"
+	@echo "make lint      check style and types"
+	@echo "make wheel     build the wheel into dist/"
+	@echo "make clean     remove everything the targets above made, .venv included"
+
+demo: .venv/installed-synth
+	@echo "==> Running the demo"
+	$(BIN)/splashbench demo demo_output
+
+test: .venv/installed-test
+	@echo "==> Running the tests"
+	$(BIN)/python -m pytest -q -m "not slow and not cuda" --durations=15
+
+test-all: .venv/installed-test
+	@echo "==> Running every test"
+	$(BIN)/python -m pytest -q --durations=15
+
+lint: .venv/installed-dev
+	@echo "==> Checking style and types"
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+wheel: .venv/ready
+	@echo "==> Building the wheel"
+	$(BIN)/python -m pip wheel --no-deps -w dist .
+
+clean:
+	rm -rf .venv build dist demo_output *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# One call of pip for each set of optional packages, repeated only when what it would install may have changed.
+.venv/installed-%: .venv/ready pyproject.toml constraints.txt
+	@echo "==> Installing splashbench[$*] and what it needs (minutes the first time: PyTorch is large)"
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e ".[$*]"
+	@touch $@
+
+# A working .venv that somebody made by hand is kept.
+.venv/ready:
+	@if $(BIN)/python -c '$(SUPPORTED)' 2>/dev/null && $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  echo "==> Using the .venv that is there"; exit 0; \
+	fi; \
+	for candidate in $(CANDIDATES); do \
+	  if "$$candidate" -c '$(SUPPORTED)' 2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	  echo "error: splashbench needs Python 3.10 to 3.13, and none of these is one: $(CANDIDATES); name one with PYTHON=..." >&2; \
+	  exit 1; \
+	fi; \
+	if ! "$$python" -c 'import ensurepip, venv' 2>/dev/null; then \
+	  echo "error: $$python cannot make a virtual environment; install its venv package (python3-venv on Debian and Ubuntu)" >&2; \
+	  exit 1; \
+	fi; \
+	echo "==> Making .venv with $$python ($$("$$python" -c 'import platform; print(platform.python_version())'))"; \
+	"$$python" -m venv --clear .venv
+	@touch $@
