@@ -185,7 +185,7 @@ def write_image(path: Path, image: NDArray[np.uint8], quality: int = 97) -> None
     if image.dtype != np.uint8:
         raise TypeError(f"images are written from uint8, not {image.dtype}")
     # Level 1: our images are small and many; the higher levels cost far more time than they save space.
-    options = {"compress_level": 1} if path.suffix == ".png" else {"quality": quality, "subsampling": 0}
+    options: dict[str, Any] = {"compress_level": 1} if path.suffix == ".png" else {"quality": quality, "subsampling": 0}
     with atomic_path(path) as temporary:
         Image.fromarray(np.ascontiguousarray(image)).save(temporary, **options)
 

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -168,7 +168,7 @@ def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | No
     return 1.0 / max(statistics.median(seconds), 1e-9)
 
 
-def _cuda():
+def _cuda() -> Any:
     """torch.cuda where the method has loaded torch and uses a device; torch is never imported for this alone."""
     torch = sys.modules.get("torch")
     return torch.cuda if torch is not None and torch.cuda.is_available() else None

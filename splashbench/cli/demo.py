@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from splashbench.cli.output import add_json, emit, say, table
@@ -21,7 +23,7 @@ About ten minutes on two cores. Look at demo_output/README.txt afterwards.
 """
 
 #: id, preset and further options of the runs; the oracle is written by the harness.
-_RUNS = (
+_RUNS: tuple[tuple[str, list[str]], ...] = (
     ("nothing", ["--preset", "quick"]),
     ("nearest_camera", []),
     ("oracle", []),
@@ -52,35 +54,35 @@ def run(arguments: argparse.Namespace) -> int:
     start = time.monotonic()
     out: Path = arguments.out
     seed = ["--seed", str(arguments.seed)]
+    session, scene, truth, results = out / "session", out / "scene", out / "verify.json", out / "results"
+    sheet, runs = out / "contact_sheet.png", {name: out / "submissions" / name for name, _ in _RUNS}
+
     steps = _Steps(arguments.fresh)
-    session, scene, runs, results = out / "session", out / "scene", out / "submissions", out / "results"
-
     steps.run("film a made-up pour", session, ["synth", "session", str(session), *seed])
-    # What follows a step made anew must be made anew too.
     steps.run("prepare the scene", scene, ["prepare", str(session), str(scene)])
-    steps.run(
-        "compare it with the truth", out / "verify.json",
-        ["synth", "verify", str(session), str(scene), "--out", str(out / "verify.json")],
-    )
+    steps.run("compare it with the truth", truth, ["synth", "verify", str(session), str(scene), "--out", str(truth)])
     for name, options in _RUNS:
-        extra = [] if name == "oracle" else [*options, *seed]
-        steps.run(f"run {name}", runs / name, ["run", name, str(scene), str(runs / name), *extra])
-    for name, _ in _RUNS:
-        steps.always(f"check {name}", ["check", str(runs / name), "--scene", str(scene)])
+        options = options if name == "oracle" else [*options, *seed]
+        steps.run(f"run {name}", runs[name], ["run", name, str(scene), str(runs[name]), *options])
+    for name, directory in runs.items():
+        steps.always(f"check {name}", ["check", str(directory), "--scene", str(scene)])
+    # The contact sheet is what scoring writes last: where it is, the results are whole.
     steps.run(
-        "score them", results,
-        ["score", *(str(runs / name) for name, _ in _RUNS), "--scene", str(scene), "--out", str(results),
-         "--reference", str(runs / "nothing"), "--sheet", str(out / "contact_sheet.png")],
+        "score them",
+        sheet,
+        ["score", *map(str, runs.values()), "--scene", str(scene), "--out", str(results)]
+        + ["--reference", str(runs["nothing"]), "--sheet", str(sheet)],
+        stale=(results,),
     )
-    steps.always("draw the leaderboard", ["leaderboard", str(results), str(out / "leaderboard"), "--replace"])
+    steps.always("draw the leaderboard", ["leaderboard", str(results), str(out / "leaderboard")])
 
-    summary = _summary(out, results, time.monotonic() - start)
-    write_text(out / "README.txt", summary["text"])
-    say()
-    say(summary["text"])
+    gates = _gates(truth, results)
+    text = _summary(out, gates, time.monotonic() - start)
+    write_text(out / "README.txt", text)
+    say(f"\n{text}")
     if arguments.json:
-        emit({key: value for key, value in summary.items() if key != "text"})
-    return 0 if summary["passed"] else 1
+        emit({"out": str(out), "passed": all(gate.passed for gate in gates), "gates": [vars(gate) for gate in gates]})
+    return 0 if all(gate.passed for gate in gates) else 1
 
 
 class _Steps:
@@ -90,15 +92,21 @@ class _Steps:
         self._fresh = fresh
         self._count = 0
 
-    def run(self, title: str, output: Path, command: list[str]) -> None:
-        """Run `command` unless its whole output is there and nothing before it has changed."""
+    def run(self, title: str, output: Path, command: list[str], stale: tuple[Path, ...] = ()) -> None:
+        """Run `command` unless its whole `output` is there and nothing before it has changed.
+
+        Before it runs, `output` and `stale` are removed: the demo made them, and they are of an earlier run.
+        """
         if output.exists() and not self._fresh:
             self._count += 1
-            say(f"[{self._count}] {title}: found {output}, kept")
+            say(f"\n[{self._count}] {title}: found {output}, kept")
             return
-        if output.exists():
-            command = [*command, "--replace"]
         self._fresh = True
+        for path in (output, *stale):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
         self.always(title, command)
 
     def always(self, title: str, command: list[str]) -> None:
@@ -115,36 +123,54 @@ class _Steps:
         say(f"    {time.monotonic() - start:.1f} s")
 
 
-def _summary(out: Path, results: Path, seconds: float) -> dict:
-    """What came out, whether it is what the demo promises, and where to look."""
+@dataclass
+class _Gate:
+    """One thing the demo promises."""
+
+    name: str
+    value: float | None
+    limit: float
+    at_most: bool
+
+    @property
+    def passed(self) -> bool:
+        if self.value is None:
+            return False
+        return self.value <= self.limit if self.at_most else self.value >= self.limit
+
+    def row(self) -> list[str]:
+        """The gate as a line of the summary."""
+        shown = "none" if self.value is None else f"{self.value:.4g}"
+        return [self.name, shown, f"{'<=' if self.at_most else '>='} {self.limit:g}", "pass" if self.passed else "FAIL"]
+
+
+def _gates(truth: Path, results: Path) -> list[_Gate]:
+    """What came out against what the demo promises."""
     from splashbench.files import read_json
     from splashbench.score.result import Result
 
-    verify = read_json(out / "verify.json")
-    found = [Result.read(path) for path in sorted(results.glob("*.json"))]
-    scores = {result.method: result.values() for result in found}
-    gates = [
-        ("largest sync error, ms", verify["sync_error_ms_max"], 1.0, True),
-        ("largest focal error, %", verify["focal_error_percent_max"], 1.0, True),
-        ("cameras posed", verify["cameras_posed"], 7, False),
-        ("mean rotation error, degrees", verify["rotation_error_deg_mean"], 0.2, True),
-        ("splashsplat PSNR over nothing, dB", scores["splashsplat"]["dpsnr_bg"], 1.0, False),
-        ("splashsplat mIoU", scores["splashsplat"]["miou"], 0.6, False),
-        ("oracle PSNR, dB", scores["oracle"]["psnr"], 100.0, False),
-        ("oracle SSIM", scores["oracle"]["ssim"], 1.0, False),
-        ("oracle mIoU", scores["oracle"]["miou"], 1.0, False),
+    verify = read_json(truth)
+    scores = {result.method: result for result in map(Result.load, sorted(results.glob("*.json")))}
+    return [
+        _Gate("largest sync error, ms", verify["sync_error_ms_max"], 1.0, True),
+        _Gate("largest focal error, %", verify["focal_error_percent_max"], 1.0, True),
+        _Gate("cameras posed", verify["cameras_posed"], 7, False),
+        _Gate("mean rotation error, degrees", verify["rotation_error_deg_mean"], 0.2, True),
+        _Gate("splashsplat, PSNR over nothing, dB", scores["splashsplat"].value("dpsnr_bg"), 1.0, False),
+        _Gate("splashsplat, mIoU", scores["splashsplat"].value("miou"), 0.6, False),
+        _Gate("oracle, PSNR, dB", scores["oracle"].value("psnr"), 100.0, False),
+        _Gate("oracle, SSIM", scores["oracle"].value("ssim"), 1.0, False),
+        _Gate("oracle, mIoU", scores["oracle"].value("miou"), 1.0, False),
     ]
-    rows, passed = [], True
-    for name, value, limit, at_most in gates:
-        good = value is not None and (value <= limit if at_most else value >= limit)
-        passed &= good
-        shown = "none" if value is None else f"{value:.4g}"
-        rows.append([name, shown, f"{'<=' if at_most else '>='} {limit:g}", "pass" if good else "FAIL"])
-    text = "\n".join(
+
+
+def _summary(out: Path, gates: list[_Gate], seconds: float) -> str:
+    """The figures, and where to look."""
+    return "\n".join(
         [
             f"splashbench demo, {seconds / 60:.1f} minutes in this run",
             "",
-            table(["what", "value", "wanted", ""], rows),
+            table(["what", "value", "wanted", ""], [gate.row() for gate in gates]),
             "",
             "look at",
             f"  {out / 'contact_sheet.png'}    truth, renders and foreground opacity at the test views",
@@ -153,10 +179,3 @@ def _summary(out: Path, results: Path, seconds: float) -> dict:
             "",
         ]
     )
-    return {
-        "passed": passed,
-        "seconds": seconds,
-        "gates": [{"name": row[0], "value": gate[1], "wanted": row[2], "passed": row[3] == "pass"}
-                  for row, gate in zip(rows, gates)],
-        "text": text,
-    }

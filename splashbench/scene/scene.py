@@ -93,13 +93,13 @@ class Scene:
         # A scene.json that only adds what the release lacks (gravity, say) changes no units; a made one has a maker.
         self.is_released = facts is not None and not (self.meta and self.meta.provenance)
         if self.meta and self.meta.times is not None:
-            self.times = self._checked_times("times", self.meta.times)
+            self.times: NDArray[np.float64] = self._checked_times("times", self.meta.times)
             self.times_source = "scene.json"
         elif facts is not None:
             self.times = np.asarray(facts.times(self.n_frames), dtype=np.float64)
             self.times_source = "manifest"
         else:
-            self.times = np.arange(self.n_frames) * NOMINAL_STEP_SECONDS
+            self.times = np.arange(self.n_frames, dtype=np.float64) * NOMINAL_STEP_SECONDS
             self.times_source = "nominal"
         own = (self.meta.camera_times if self.meta else None) or {}
         self.camera_times = {
