@@ -1,0 +1,60 @@
+"""`splashbench leaderboard RESULTS OUT`: table and charts from a folder of results."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splashbench.cli.output import add_json, emit, say
+
+_EPILOG = """\
+examples:
+  splashbench leaderboard results leaderboard
+  splashbench leaderboard results leaderboard --with-paper       the paper's figures in panels of their own
+
+OUT gets leaderboard.csv, leaderboard.md, speed_accuracy.png and speed_accuracy.svg. Failed runs keep their rows, and
+runs on different machines never share a chart. The same results give the same bytes.
+"""
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = subparsers.add_parser(
+        "leaderboard",
+        help="table and charts from results",
+        description="Make a leaderboard (CSV, Markdown) and the speed-accuracy chart (PNG, SVG) from results.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("results", type=Path, metavar="RESULTS", help="folder with results, from `splashbench score`")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder the leaderboard is written into")
+    parser.add_argument("--with-paper", action="store_true", help="chart the paper's figures, as reported, beside them")
+    add_json(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench leaderboard`."""
+    from splashbench.report.charts import speed_accuracy_chart
+    from splashbench.report.leaderboard import leaderboard_rows, write_leaderboard
+    from splashbench.report.results import load_results
+
+    sources = load_results(arguments.results)
+    files = write_leaderboard(sources, arguments.out)
+    files += speed_accuracy_chart(sources, arguments.out, with_paper=arguments.with_paper)
+    rows = leaderboard_rows(sources)
+    failed = sum(not row.ok for row in rows)
+    say(f"{len(sources)} results, {len(rows)} rows{f', {failed} of them failed runs' if failed else ''}")
+    for file in files:
+        say(f"wrote {file}")
+    if arguments.json:
+        emit(
+            {
+                "results": len(sources),
+                "rows": len(rows),
+                "failed_runs": failed,
+                "files": [str(file) for file in files],
+                "sources": [source.path for source in sources],
+            }
+        )
+    return 0

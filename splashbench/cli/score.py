@@ -1,0 +1,139 @@
+"""`splashbench score SUBMISSION... --scene SCENE --out DIR`: one result per submission."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splashbench.cli.output import add_json, emit, say, table
+
+if TYPE_CHECKING:
+    from splashbench.score import Protocol, Result
+
+_EPILOG = """\
+examples:
+  splashbench score runs/bowl_001/splashsplat --scene scenes/bowl_001 --out results
+  splashbench score runs/bowl_001/* --scene scenes/bowl_001 --out results --reference runs/bowl_001/nothing
+
+Ground truth comes from SCENE alone. A run that failed becomes a result with its status and no score. --reference, the
+submission of the control `nothing` on the same scene, gives dpsnr_bg and spill_rgb. LPIPS needs weights: the option,
+the environment variable SPLASHBENCH_LPIPS_WEIGHTS, or an installed lpips package with torchvision's AlexNet cached;
+without them it is null.
+"""
+
+# The figures of the small table; the result has all of them.
+_SHOWN = ("psnr", "dpsnr_bg", "ssim", "lpips", "miou", "spill", "jitter_error", "uniformity", "delta_e", "fit_seconds")
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = subparsers.add_parser(
+        "score",
+        help="score submissions by protocol v1",
+        description="Score each SUBMISSION against SCENE and write one result (JSON) for each into DIR.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("submissions", nargs="+", type=Path, metavar="SUBMISSION", help="folder of a submission")
+    parser.add_argument("--scene", type=Path, required=True, help="folder of the scene the submissions are of")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder the results are written into")
+    parser.add_argument("--reference", type=Path, metavar="SUBMISSION", help="the control `nothing` on this scene")
+    parser.add_argument("--lpips-weights", type=Path, metavar="FILE", help=".npz of LPIPS weights (AlexNet, v0.1)")
+    parser.add_argument("--sheet", type=Path, metavar="PNG", help="also draw a contact sheet of all submissions")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="changes",
+        help="change a setting of the protocol; such results are kept apart from v1's",
+    )
+    add_json(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench score`."""
+    from splashbench.scene import Scene
+    from splashbench.score import score_submission, shared_fields
+    from splashbench.submission import Submission
+
+    protocol = _protocol(arguments.changes)
+    scene = Scene.open(arguments.scene)
+    # All are opened, hence verified, before hours may go into scoring the first.
+    submissions = [Submission.open(path) for path in arguments.submissions]
+    reference = Submission.open(arguments.reference) if arguments.reference else None
+    fields = shared_fields(scene, protocol)
+    results, files = [], []
+    for path, submission in zip(arguments.submissions, submissions):
+        say(f"{path}: {submission.identity.method} on {scene.name}")
+        result = score_submission(
+            scene, submission, reference, arguments.lpips_weights, protocol=protocol, fields=fields
+        )
+        results.append(result)
+        files.append(str(result.save(arguments.out)))
+    if arguments.sheet:
+        from splashbench.report.contact_sheet import contact_sheet
+
+        contact_sheet(scene, submissions, arguments.sheet)
+    say(_summary(results))
+    for file in files:
+        say(f"wrote {file}")
+    if arguments.json:
+        emit(
+            {
+                "scene": scene.name,
+                "protocol": protocol.label,
+                "results": [
+                    {"file": file, "method": r.method, "preset": r.preset, "seed": r.seed, "status": r.status}
+                    | {"reason": r.reason, "metrics": {name: metric.value for name, metric in r.metrics.items()}}
+                    for file, r in zip(files, results)
+                ],
+            }
+        )
+    return 0
+
+
+def _protocol(changes: list[str]) -> Protocol:
+    """Protocol v1 with the KEY=VALUE changes asked for."""
+    from pydantic import ValidationError
+
+    from splashbench.errors import SplashbenchError
+    from splashbench.score import Protocol
+
+    values = {}
+    for change in changes:
+        key, separator, value = change.partition("=")
+        if not separator or not key:
+            raise SplashbenchError(f"--set {change!r} is not KEY=VALUE; known: {', '.join(Protocol.model_fields)}")
+        values[key] = value
+    try:
+        return Protocol.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        known = ", ".join(Protocol.model_fields)
+        raise SplashbenchError(f"--set {first['loc'][0]}: {first['msg']}; known settings: {known}") from None
+
+
+def _summary(results: list[Result]) -> str:
+    from splashbench.score import METRICS
+    from splashbench.score.metrics import format_value
+
+    rows = []
+    for result in results:
+        cells = [format_value(name, result.value(name), "-") for name in _SHOWN]
+        rows.append([result.method, str(result.seed), result.status, *cells])
+    lines = [table(["method", "seed", "status", *(METRICS[name].label for name in _SHOWN)], rows)]
+    missing = {
+        f"{name}: {metric.reason}"
+        for result in results
+        if result.status == "ok"
+        for name, metric in result.metrics.items()
+        if metric.value is None and METRICS[name].group != "cost"
+    }
+    lines += [f"null {reason}" for reason in sorted(missing)]
+    lines += [
+        f"{result.method} failed: {result.reason or result.status}" for result in results if result.status != "ok"
+    ]
+    return "\n".join(lines)

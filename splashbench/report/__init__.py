@@ -1,0 +1,1 @@
+"""Results to leaderboard, charts and contact sheets. Everything is generated from results and never edited."""

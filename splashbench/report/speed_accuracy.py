@@ -1,0 +1,178 @@
+"""What the speed-accuracy chart shows, as numbers: dots, means with intervals, Pareto front, yardsticks, failures.
+
+docs/protocol.md, "Charts". One chart row per machine: a front that mixes hardware would compare machines, not methods.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.report.results import Source, hardware_label, settings_digest
+from splashbench.score.result import Result
+
+_BOOTSTRAP_SAMPLES = 2000
+_MIN_RUNS_FOR_BARS = 3
+_TRIM = 0.25
+
+
+@dataclass(frozen=True)
+class Dot:
+    """One run, or one reported figure: seconds of fitting, and the values it has."""
+
+    seconds: float
+    values: dict[str, float]
+    memory_bytes: float | None
+
+
+@dataclass
+class Entry:
+    """A method with its settings on one machine."""
+
+    label: str
+    dots: list[Dot] = field(default_factory=list)
+    scenes: set[str] = field(default_factory=set)
+
+    def memory_bytes(self) -> float | None:
+        """Median over the runs that measured it."""
+        known = [dot.memory_bytes for dot in self.dots if dot.memory_bytes is not None]
+        return float(np.median(known)) if known else None
+
+    def summary(self, name: str) -> Summary | None:
+        """Inter-quartile mean of time and of metric `name` over the runs that have it."""
+        pairs = np.array([[np.log10(d.seconds), d.values[name]] for d in self.dots if name in d.values])
+        return summarize(pairs) if len(pairs) else None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Inter-quartile means, and their 95% bootstrap intervals where three runs or more allow them."""
+
+    seconds: float
+    value: float
+    seconds_interval: tuple[float, float] | None
+    value_interval: tuple[float, float] | None
+
+
+@dataclass
+class Machine:
+    """One row of panels: everything measured on one machine, or reported for it."""
+
+    title: str
+    n_scenes: int = 1
+    reported: bool = False
+    entries: list[Entry] = field(default_factory=list)
+    controls: dict[str, dict[str, float]] = field(default_factory=dict)
+    failures: Counter[str] = field(default_factory=Counter)
+
+    def quality_name(self) -> str:
+        """`dpsnr_bg` where every run has it, else `psnr`: one panel never mixes the two."""
+        dots = [dot for entry in self.entries for dot in entry.dots]
+        return "dpsnr_bg" if dots and all("dpsnr_bg" in dot.values for dot in dots) else "psnr"
+
+
+def summarize(pairs: NDArray[np.float64]) -> Summary:
+    """Inter-quartile means of `pairs` [n, 2] of (log10 seconds, value), runs resampled together for the intervals."""
+    from scipy.stats import trim_mean
+
+    log_seconds, value = trim_mean(pairs, _TRIM, axis=0)
+    if len(pairs) < _MIN_RUNS_FOR_BARS:
+        return Summary(float(10**log_seconds), float(value), None, None)
+    rng = np.random.default_rng(0)
+    resampled = pairs[rng.integers(len(pairs), size=(_BOOTSTRAP_SAMPLES, len(pairs)))]
+    low, high = np.percentile(trim_mean(resampled, _TRIM, axis=1), [2.5, 97.5], axis=0)
+    return Summary(
+        float(10**log_seconds),
+        float(value),
+        (float(10 ** low[0]), float(10 ** high[0])),
+        (float(low[1]), float(high[1])),
+    )
+
+
+def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
+    """The points (seconds, value) that no other beats in both, fastest first."""
+    sign = 1.0 if higher_is_better else -1.0
+    front: list[tuple[float, float]] = []
+    for seconds, value in sorted(points, key=lambda point: (point[0], -sign * point[1])):
+        if not front or sign * value > sign * front[-1][1]:
+            front.append((seconds, value))
+    return front
+
+
+def machines(sources: Sequence[Source]) -> list[Machine]:
+    """The measured results by machine, in order of name; controls and failed runs set apart, none dropped."""
+    by_machine: dict[str, list[Result]] = defaultdict(list)
+    for source in sources:
+        by_machine[hardware_label(source.result.hardware)].append(source.result)
+    return [_machine(title, results) for title, results in sorted(by_machine.items())]
+
+
+def _machine(title: str, results: list[Result]) -> Machine:
+    scenes = len({result.digests.scene for result in results})
+    machine = Machine(f"{title} · {scenes} scene{'' if scenes == 1 else 's'}, {_protocols(results)}", scenes)
+    entries: dict[str, Entry] = {}
+    controls: dict[str, list[dict[str, float]]] = defaultdict(list)
+    names = _labels(results)
+    for result in results:
+        values = {name: value for name in ("lpips", "dpsnr_bg", "psnr") if (value := result.value(name)) is not None}
+        seconds = result.value("fit_seconds")
+        if result.status != "ok":
+            machine.failures[f"{result.method}: {result.status}"] += 1
+        elif result.control:
+            controls[result.method].append(values)
+        elif not seconds or seconds <= 0:
+            machine.failures[f"{result.method}: fit time not measured"] += 1
+        else:
+            label = names[_key(result)]
+            memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
+            entry = entries.setdefault(label, Entry(label))
+            entry.dots.append(Dot(seconds, values, memory))
+            entry.scenes.add(result.digests.scene)
+    machine.entries = [entries[label] for label in sorted(entries)]
+    for method, runs in sorted(controls.items()):
+        known = {name for run in runs for name in run}
+        machine.controls[method] = {
+            name: float(np.mean([run[name] for run in runs if name in run])) for name in sorted(known)
+        }
+    return machine
+
+
+def _protocols(results: list[Result]) -> str:
+    return "protocol " + ", ".join(sorted({result.protocol.label for result in results}))
+
+
+def _key(result: Result) -> tuple[str, str, str]:
+    return (result.method, result.preset, settings_digest(result))
+
+
+def _labels(results: list[Result]) -> dict[tuple[str, str, str], str]:
+    """Method, with the preset where it has several, and the settings' digest where a preset has several."""
+    keys = {_key(result) for result in results}
+    labels = {}
+    for method, preset, digest in keys:
+        presets = {key[1] for key in keys if key[0] == method}
+        twins = {key for key in keys if key[:2] == (method, preset)}
+        label = method if len(presets) == 1 else f"{method} [{preset}]"
+        labels[method, preset, digest] = label if len(twins) == 1 else f"{label} {digest}"
+    return labels
+
+
+def reported_machine() -> Machine:
+    """The paper's main table (means over its 20 scenes), as reported on its own machine."""
+    from splashbench_leaderboards import paper_rows
+
+    machine = Machine("", reported=True)
+    for row in paper_rows():
+        minutes = row["train_minutes"]
+        if not isinstance(minutes, float):
+            continue
+        values = {name: value for name in ("psnr", "lpips") if isinstance(value := row[name], float)}
+        memory = row["memory_gib"]
+        bytes_ = memory * 2**30 if isinstance(memory, float) else None
+        machine.entries.append(Entry(str(row["method"]), [Dot(minutes * 60, values, bytes_)]))
+        machine.title = f"{row['hardware']} by the paper · means over {row['scene_set']}"
+    return machine

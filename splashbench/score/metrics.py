@@ -1,0 +1,79 @@
+"""The registry of metrics: what each figure is called, its unit, and whether higher or lower is better.
+
+The names are the keys of a result's `metrics` and the columns of the leaderboard.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Better = Literal["higher", "lower"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure of a result.
+
+    Attributes:
+        name: key in JSON and column in CSV.
+        title: for tables and charts.
+        unit: of the stored value; "" for a pure number.
+        better: direction of better, or None where neither is.
+        decimals: printed in CSV and tables; results keep full precision.
+        source: where the definition comes from.
+        group: "image", "particles" (both computed here) or "cost" (measured by the harness).
+        version: of the implementation; raised when a change alters values.
+    """
+
+    name: str
+    title: str
+    unit: str
+    better: Better | None
+    decimals: int
+    source: str
+    group: Literal["image", "particles", "cost"]
+    version: int = 1
+
+    @property
+    def label(self) -> str:
+        """Title with unit and arrow, for a table's head."""
+        arrow = {"higher": " ↑", "lower": " ↓", None: ""}[self.better]
+        return f"{self.title}{f' ({self.unit})' if self.unit else ''}{arrow}"
+
+
+_PAPER = "paper, Metrics"
+_SUPPLEMENT = "paper, supplement, Evaluation Protocol"
+_HERE = "protocol v1"
+
+METRICS: dict[str, Metric] = {
+    metric.name: metric
+    for metric in (
+        Metric("psnr", "PSNR", "dB", "higher", 2, _PAPER, "image"),
+        Metric("dpsnr_bg", "PSNR over background", "dB", "higher", 2, _HERE, "image"),
+        Metric("ssim", "SSIM", "", "higher", 4, _PAPER, "image"),
+        Metric("ssim_fg", "SSIM foreground", "", "higher", 4, _HERE, "image"),
+        Metric("lpips", "LPIPS", "", "lower", 4, _PAPER, "image"),
+        Metric("spill", "Spill", "", "lower", 4, _HERE, "image"),
+        Metric("spill_rgb", "Spill RGB", "", "lower", 4, _HERE, "image"),
+        Metric("jitter_error", "Jitter error", "", "lower", 4, _PAPER, "image"),
+        Metric("sigma_d", "σ_D", "", "lower", 1, _SUPPLEMENT, "particles"),
+        Metric("mu_d", "μ_D", "", None, 1, _SUPPLEMENT, "particles"),
+        Metric("uniformity", "Uniformity index", "", "lower", 3, _HERE, "particles"),
+        Metric("delta_e", "ΔE", "", "lower", 3, _HERE, "particles"),
+        Metric("miou", "mIoU@0.5", "", "higher", 4, "paper, Ablation Study", "image"),
+        Metric("fit_seconds", "Fit time", "s", "lower", 1, _HERE, "cost"),
+        Metric("render_fps", "FPS", "1/s", "higher", 1, _HERE, "cost"),
+        Metric("peak_memory_bytes", "Peak memory", "B", "lower", 0, _HERE, "cost"),
+        Metric("peak_device_memory_bytes", "Peak device memory", "B", "lower", 0, _HERE, "cost"),
+        Metric("storage_bytes", "Storage", "B", "lower", 0, _HERE, "cost"),
+        Metric("dynamic_bytes", "Dynamic storage", "B", "lower", 0, _HERE, "cost"),
+        Metric("primitives_per_frame", "Primitives per frame", "", None, 0, _HERE, "cost"),
+        Metric("carriers_per_frame", "Carriers per frame", "", None, 0, _HERE, "cost"),
+    )
+}
+
+
+def format_value(name: str, value: float | None, missing: str = "") -> str:
+    """`value` of metric `name` with the registry's decimals; `missing` where there is none."""
+    return missing if value is None else f"{value:.{METRICS[name].decimals}f}"

@@ -1,0 +1,152 @@
+"""Scoring: Submission -> Result by one fixed protocol (paper, "Metrics"; every choice: docs/protocol.md).
+
+The scene is the only ground truth, test views the only images looked at, training masks the only geometry.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from splashbench import progress
+from splashbench.errors import SplashbenchError
+from splashbench.scene import Scene
+from splashbench.score.lpips import load_lpips
+from splashbench.score.metrics import METRICS
+from splashbench.score.physics import score_particles
+from splashbench.score.result import Digests, MetricValue, Result, metric_value
+from splashbench.score.settings import PROTOCOL_V1, Protocol
+from splashbench.score.uniformity import DistanceFields
+from splashbench.score.views import Track, score_views
+from splashbench.version import __version__
+
+REFERENCE_METHOD = "nothing"
+_OK = "ok"
+
+
+def score_submission(
+    scene: Scene,
+    submission: Any,
+    reference: Any | None = None,
+    lpips_weights: Path | None = None,
+    track: Track = progress.track,
+    *,
+    protocol: Protocol = PROTOCOL_V1,
+    fields: Callable[[], DistanceFields] | None = None,
+) -> Result:
+    """Score one verified submission (`splashbench.submission.Submission`) of `scene`.
+
+    Args:
+        reference: the submission of the control `nothing` on this scene; without it what needs it is null.
+        lpips_weights: an .npz of LPIPS weights, see `splashbench.score.lpips.load_lpips`.
+        track: wraps an iterable with a description, to show progress.
+        protocol: other settings than v1's make a result that no table mixes with v1.
+        fields: signed distance from the training masks when several submissions share it, see `shared_fields`.
+
+    Raises SplashbenchError when the submission or the reference is of another scene, or not as it was checked.
+    A submission that is not "ok" gives a result with that status and reason, and no score.
+    """
+    identity = submission.identity
+    _require_same_scene(scene, submission, "submission")
+    if reference is not None:
+        _require_reference(scene, reference)
+    status = _text(submission.status)
+    metrics = _costs(submission.record)
+    weights_digest = None
+    if status == _OK:
+        lpips, no_lpips = load_lpips(lpips_weights)
+        weights_digest = lpips.digest if lpips else None
+        metrics |= score_views(scene, submission, reference, lpips, no_lpips, protocol, track)
+        metrics |= score_particles(scene, submission, fields or shared_fields(scene, protocol), protocol, track)
+    else:
+        no_score = f"the run ended with status {status}"
+        metrics |= {name: metric_value(name, None, no_score) for name, m in METRICS.items() if m.group != "cost"}
+    return Result(
+        method=identity.method,
+        method_version=identity.method_version,
+        scene=scene.name,
+        seed=identity.seed,
+        preset=identity.preset,
+        settings=identity.settings,
+        control=identity.control,
+        mixed=identity.mixed,
+        status=status,
+        reason=submission.reason,
+        protocol=protocol,
+        digests=Digests(
+            scene=scene.digest,
+            submission=submission.digest,
+            protocol=protocol.digest,
+            reference=reference.digest if reference is not None else None,
+            lpips_weights=weights_digest,
+        ),
+        metrics={name: metrics[name] for name in METRICS},
+        claimed={name: value for name, value in identity.claimed.items() if math.isfinite(value)},
+        hardware=identity.hardware,
+        times_source=scene.times_source,
+        versions=_versions(),
+    )
+
+
+def shared_fields(scene: Scene, protocol: Protocol = PROTOCOL_V1) -> Callable[[], DistanceFields]:
+    """A function giving the scene's signed distance fields: computed at the first call, from training masks alone."""
+    computed: list[DistanceFields] = []
+
+    def fields() -> DistanceFields:
+        if not computed:
+            from splashbench.observe import signed_distance_fields
+
+            computed.append(signed_distance_fields(scene.training(), cells_longest_axis=protocol.grid_cells))
+        return computed[0]
+
+    return fields
+
+
+def _text(status: Any) -> str:
+    return str(getattr(status, "value", status))
+
+
+def _require_same_scene(scene: Scene, submission: Any, what: str) -> None:
+    if submission.identity.scene_digest != scene.digest:
+        raise SplashbenchError(
+            f"the {what} of {submission.identity.method} was made for another version of scene "
+            f"{submission.identity.scene}, not for {scene.directory}; give the scene it was run on, or run it again"
+        )
+
+
+def _require_reference(scene: Scene, reference: Any) -> None:
+    if reference.identity.method != REFERENCE_METHOD or not reference.identity.control:
+        raise SplashbenchError(
+            f"the reference is a submission of {reference.identity.method}; give one of the control {REFERENCE_METHOD}"
+        )
+    if _text(reference.status) != _OK:
+        raise SplashbenchError(
+            f"the reference ended with status {_text(reference.status)}; run {REFERENCE_METHOD} again"
+        )
+    _require_same_scene(scene, reference, "reference")
+
+
+def _costs(record: Any) -> dict[str, MetricValue]:
+    """What the harness measured; the method has no say in it."""
+    return {
+        name: metric_value(name, _number(getattr(record, name)), "not measured")
+        for name, metric in METRICS.items()
+        if metric.group == "cost"
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+def _versions() -> dict[str, str]:
+    """The software the figures depend on."""
+    return {
+        "splashbench": __version__,
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
+    }

@@ -1,0 +1,129 @@
+"""A result: one immutable JSON per method, scene, preset and seed, with every value behind every mean.
+
+A figure that could not be had is null and says why; a run that failed is a result with a status, a reason and nulls,
+and never a score. Results name by digest what they were computed from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from splashbench.files import read_model, write_model
+from splashbench.score.metrics import METRICS, Better
+from splashbench.score.settings import Protocol
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.+-]+")
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ViewValues(_Frozen):
+    """A metric in one test view: its mean and the value of each frame, null for a skipped one."""
+
+    value: float | None = Field(default=None, allow_inf_nan=False)
+    frames: tuple[float | None, ...] = ()
+
+
+class MetricValue(_Frozen):
+    """One metric of a result; unit and direction stand beside the value.
+
+    views: per test view, for image metrics. frames: per frame, for particle metrics. skipped_frames: how many
+    (frame, view) pairs or frames had no value.
+    """
+
+    value: float | None = Field(default=None, allow_inf_nan=False)
+    reason: str | None = None
+    unit: str = ""
+    better: Better | None = None
+    version: int = 1
+    skipped_frames: int = 0
+    views: dict[str, ViewValues] = Field(default_factory=dict)
+    frames: tuple[float | None, ...] = ()
+
+
+class Digests(_Frozen):
+    """SHA-256 of everything a result depends on; null is not used."""
+
+    scene: str
+    submission: str
+    protocol: str
+    reference: str | None = None
+    lpips_weights: str | None = None
+
+
+class Result(_Frozen):
+    """The score of one submission. `metrics` has every name of the registry."""
+
+    schema_version: Literal[1] = 1
+    method: str
+    method_version: str
+    scene: str
+    seed: int
+    preset: str
+    settings: dict[str, Any] = Field(default_factory=dict)
+    control: bool = False
+    mixed: bool = False
+    status: str
+    reason: str = ""
+    protocol: Protocol
+    digests: Digests
+    metrics: dict[str, MetricValue]
+    claimed: dict[str, float] = Field(default_factory=dict)
+    hardware: dict[str, Any] = Field(default_factory=dict)
+    times_source: str = ""
+    versions: dict[str, str] = Field(default_factory=dict)
+
+    def value(self, name: str) -> float | None:
+        """The value of metric `name`, or None."""
+        metric = self.metrics.get(name)
+        return metric.value if metric else None
+
+    @property
+    def file_name(self) -> str:
+        """METHOD__SCENE__PRESET__seedK__DIGEST8.json, a convenience: identity is in the file."""
+        exact = hashlib.sha256(f"{self.digests.submission} {self.digests.protocol}".encode()).hexdigest()
+        parts = (self.method, self.scene, self.preset)
+        return "__".join([*(_UNSAFE.sub("-", part)[:60] for part in parts), f"seed{self.seed}", exact[:8]]) + ".json"
+
+    def save(self, directory: Path) -> Path:
+        """Write the result into `directory` under `file_name`; returns the path."""
+        path = Path(directory, self.file_name)
+        write_model(path, self)
+        return path
+
+    @classmethod
+    def load(cls, path: Path) -> Result:
+        """Read a result; one-line errors name the file and the entry."""
+        return read_model(path, cls)
+
+
+def metric_value(
+    name: str,
+    value: float | None,
+    reason: str | None = None,
+    *,
+    skipped_frames: int = 0,
+    views: dict[str, ViewValues] | None = None,
+    frames: tuple[float | None, ...] = (),
+) -> MetricValue:
+    """A MetricValue of registry entry `name`. A null needs a reason."""
+    if value is None and not reason:
+        raise ValueError(f"{name} is null without a reason")
+    metric = METRICS[name]
+    return MetricValue(
+        value=value,
+        reason=None if value is not None else reason,
+        unit=metric.unit,
+        better=metric.better,
+        version=metric.version,
+        skipped_frames=skipped_frames,
+        views=views or {},
+        frames=frames,
+    )

@@ -1,0 +1,111 @@
+"""Charts: what they draw is right, nothing is dropped, and the bytes are the same each time."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splashbench.files import image_size
+from splashbench.report.charts import speed_accuracy_chart
+from splashbench.report.leaderboard import Row
+from splashbench.report.markdown import to_markdown
+from splashbench.report.results import Source, load_results
+from splashbench.report.speed_accuracy import machines, pareto_front, reported_machine, summarize
+
+
+def test_pareto_front_keeps_what_nothing_beats_in_both() -> None:
+    points = [(1.0, 5.0), (2.0, 4.0), (3.0, 8.0), (3.0, 7.0), (9.0, 8.0)]
+    assert pareto_front(points, higher_is_better=True) == [(1.0, 5.0), (3.0, 8.0)]
+    assert pareto_front(points, higher_is_better=False) == [(1.0, 5.0), (2.0, 4.0)]
+
+
+def test_summary_is_the_interquartile_mean_with_an_interval_around_it() -> None:
+    values = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1000.0])
+    summary = summarize(np.stack([np.log10([10.0] * 8), values], axis=1))
+    assert summary.value == pytest.approx(3.5)
+    assert summary.seconds == pytest.approx(10.0)
+    assert summary.value_interval is not None
+    assert summary.value_interval[0] < 3.5 < summary.value_interval[1]
+    assert summarize(np.array([[1.0, 2.0], [1.0, 4.0]])).value_interval is None
+
+
+def test_runs_are_sorted_into_machines_methods_controls_and_failures(folder: Path, make_result: Any) -> None:
+    make_result("delta", cpu="another processor", psnr=19.0, fit_seconds=7.0).save(folder)
+    other, first = machines(load_results(folder))
+    assert (other.title.split(" ·")[0], first.title.split(" ·")[0]) == (
+        "another processor, 2 cores",
+        "test processor, 2 cores",
+    )
+    assert [(entry.label, len(entry.dots)) for entry in first.entries] == [("alpha", 6), ("beta", 6)]
+    assert set(first.controls) == {"nothing", "oracle"}
+    assert dict(first.failures) == {"gamma: out_of_memory": 1}
+    assert first.quality_name() == "dpsnr_bg"
+    assert other.quality_name() == "psnr"
+
+
+def test_the_gain_over_background_is_charted_only_when_every_run_has_it(make_result: Any) -> None:
+    results = [
+        make_result("alpha", 0, psnr=20.0, dpsnr_bg=2.0, fit_seconds=5.0),
+        make_result("beta", 0, psnr=19.0, fit_seconds=5.0),
+    ]
+    (machine,) = machines([Source(f"{i}.json", result) for i, result in enumerate(results)])
+    assert machine.quality_name() == "psnr"
+
+
+def test_presets_and_settings_of_a_method_are_told_apart(make_result: Any) -> None:
+    results = [
+        make_result("alpha", 0, psnr=20.0, fit_seconds=5.0),
+        make_result("alpha", 0, psnr=20.0, fit_seconds=5.0, preset="quick"),
+        make_result("alpha", 0, psnr=20.0, fit_seconds=5.0, preset="quick", settings={"grid": 48}),
+    ]
+    (machine,) = machines([Source(f"{i}.json", result) for i, result in enumerate(results)])
+    labels = [entry.label for entry in machine.entries]
+    assert labels[0] == "alpha [best]"
+    assert all(re.fullmatch(r"alpha \[quick\] [0-9a-f]{8}", label) for label in labels[1:])
+
+
+def test_a_run_without_a_fit_time_is_shown_as_such(make_result: Any) -> None:
+    (machine,) = machines([Source("a.json", make_result("alpha", psnr=20.0))])
+    assert dict(machine.failures) == {"alpha: fit time not measured": 1}
+
+
+def test_odd_names_from_strangers_files_are_drawn_as_they_are(make_result: Any, tmp_path: Path) -> None:
+    odd = make_result("alpha", 0, "bowl", "$\\broken{", "why", cpu="$\\frac{ <b>")
+    _, svg = speed_accuracy_chart([Source("a.json", odd)], tmp_path)
+    assert "$\\broken{" in svg.read_text()
+    text = to_markdown([Row((odd,))], [Source("a.json", odd)])
+    assert "<b>" not in text
+
+
+def test_the_papers_figures_stand_on_a_machine_of_their_own() -> None:
+    machine = reported_machine()
+    assert machine.reported
+    assert "as reported" in machine.title
+    by_label = {entry.label: entry.dots[0] for entry in machine.entries}
+    assert by_label["splashsplat"].values == {"psnr": 20.13, "lpips": 0.0806}
+    assert by_label["splashsplat"].seconds == pytest.approx(37.8 * 60)
+    assert len(by_label) == 4
+
+
+def test_charts_show_every_run_and_have_the_same_bytes_each_time(folder: Path, tmp_path: Path) -> None:
+    sources = load_results(folder)
+    png, svg = speed_accuracy_chart(sources, tmp_path / "a", with_paper=True)
+    again = speed_accuracy_chart(sources, tmp_path / "b", with_paper=True)
+    assert [png.read_bytes(), svg.read_bytes()] == [path.read_bytes() for path in again]
+    assert image_size(png)[0] > 1000
+    text = svg.read_text()
+    comments = set(re.findall(r"<!-- (.*?) -->", text))
+    for shown in ("✕ gamma: out_of_memory", "control: nothing", "beta", "splashsplat"):
+        assert shown in comments
+    assert any("test processor, 2 cores" in comment for comment in comments)
+    assert any("V100" in comment for comment in comments)
+    assert not re.search(r"\b20\d\d-\d\d-\d\d", text)
+
+
+@pytest.mark.parametrize("status", ["ok", "crashed"])
+def test_a_chart_of_one_run_or_of_failures_alone_can_be_drawn(make_result: Any, tmp_path: Path, status: str) -> None:
+    values = {"psnr": 20.0, "fit_seconds": 5.0} if status == "ok" else {}
+    png, _ = speed_accuracy_chart([Source("a.json", make_result("alpha", 0, "bowl", status, **values))], tmp_path)
+    assert image_size(png)[1] > 300

@@ -1,0 +1,126 @@
+"""The leaderboard: failures keep their rows, seeds are summarised, the same results give the same bytes."""
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splashbench.errors import SplashbenchError
+from splashbench.report.leaderboard import CSV_COLUMNS, Row, leaderboard_rows, to_csv, write_leaderboard
+from splashbench.report.markdown import to_markdown
+from splashbench.report.results import Source, load_results
+
+
+def _table(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(to_csv(leaderboard_rows(load_results(folder))))))
+
+
+def test_columns_begin_with_the_names_of_the_schema() -> None:
+    assert CSV_COLUMNS[:8] == ("method", "scene", "seed", "preset", "status", "reason", "psnr", "dpsnr_bg")
+    assert len(set(CSV_COLUMNS)) == len(CSV_COLUMNS)
+
+
+def test_rows_are_medians_over_seeds_sorted_by_scene_then_lpips(folder: Path) -> None:
+    rows = _table(folder)
+    assert [(row["scene"], row["method"]) for row in rows] == [
+        ("bowl", "oracle"),
+        ("bowl", "alpha"),
+        ("bowl", "beta"),
+        ("bowl", "nothing"),
+        ("bowl", "gamma"),
+        ("tank", "oracle"),
+        ("tank", "alpha"),
+        ("tank", "beta"),
+        ("tank", "nothing"),
+    ]
+    alpha = rows[1]
+    assert (alpha["seed"], alpha["runs"]) == ("0 1 2", "3")
+    assert (alpha["psnr"], alpha["psnr_spread"]) == ("19.90", "0.20")
+    assert alpha["sigma_d"] == ""
+    assert rows[0]["psnr_spread"] == ""
+
+
+def test_failures_keep_their_rows_and_reasons(folder: Path) -> None:
+    failed = [row for row in _table(folder) if row["status"] != "ok"]
+    assert [(row["method"], row["status"], row["psnr"]) for row in failed] == [("gamma", "out_of_memory", "")]
+    assert failed[0]["reason"] == "killed (signal 9) | of 8 GiB"
+    sources = load_results(folder)
+    text = to_markdown(leaderboard_rows(sources), sources)
+    assert "| gamma | best | 0 | out_of_memory |" in text
+    assert "- gamma (best, seed 0) on bowl: out_of_memory: killed (signal 9)" in text
+
+
+def test_a_seed_that_fails_is_not_averaged_away(folder: Path, make_result: Any) -> None:
+    make_result("alpha", 7, "bowl", "crashed", "NaN in the loss").save(folder)
+    rows = [row for row in _table(folder) if (row["scene"], row["method"]) == ("bowl", "alpha")]
+    assert [(row["seed"], row["status"]) for row in rows] == [("0 1 2", "ok"), ("7", "crashed")]
+
+
+def test_controls_are_marked_and_never_best(folder: Path) -> None:
+    sources = load_results(folder)
+    text = to_markdown(leaderboard_rows(sources), sources)
+    assert "| *oracle* |" in text
+    assert "**100.00**" not in text
+    assert "**19.90** ± 0.10" in text
+    assert {row["method"]: row["control"] for row in _table(folder)}["nothing"] == "true"
+
+
+def test_means_over_scenes_leave_out_methods_that_failed_on_one(folder: Path, make_result: Any) -> None:
+    def means() -> dict[str, str]:
+        sources = load_results(folder)
+        text = to_markdown(leaderboard_rows(sources), sources)
+        section = text.partition("## Mean over 2 scenes")[2].partition("## Hardware")[0]
+        lines = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
+        return {line[0]: line[3] for line in lines}
+
+    assert means()["alpha"] == "19.55"
+    assert means()["gamma"] == "–"
+    make_result("alpha", 7, "tank", "timeout", "over 60 s").save(folder)
+    assert means()["alpha"] == "–"
+
+
+def test_bytes_do_not_depend_on_where_or_in_which_order_results_lie(folder: Path, tmp_path: Path) -> None:
+    first = [path.read_bytes() for path in write_leaderboard(load_results(folder), tmp_path / "a")]
+    again = [path.read_bytes() for path in write_leaderboard(load_results(folder), tmp_path / "b")]
+    assert first == again
+    for i, path in enumerate(sorted(folder.glob("*.json"), reverse=True)):
+        (tmp_path / "moved" / str(i)).mkdir(parents=True)
+        (tmp_path / "moved" / str(i) / "result.json").write_bytes(path.read_bytes())
+    assert to_csv(leaderboard_rows(load_results(tmp_path / "moved"))).encode() == first[0]
+
+
+def test_runs_with_other_settings_hardware_or_protocol_are_never_averaged(make_result: Any) -> None:
+    results = [
+        make_result("alpha", 0, psnr=10.0),
+        make_result("alpha", 1, psnr=20.0, settings={"iterations": 5}),
+        make_result("alpha", 2, psnr=30.0, cpu="another processor"),
+        make_result("alpha", 3, psnr=40.0, method_version="2"),
+    ]
+    rows = leaderboard_rows([Source(f"{i}.json", result) for i, result in enumerate(results)])
+    assert [row.value("psnr") for row in rows] == [40.0, 30.0, 20.0, 10.0]
+    assert all(len(row.runs) == 1 for row in rows)
+
+
+def test_the_better_informed_of_two_scores_of_one_submission_stands(tmp_path: Path, make_result: Any) -> None:
+    make_result("alpha", psnr=20.0, lpips=0.1).save(tmp_path / "with")
+    make_result("alpha", psnr=20.0).save(tmp_path / "without")
+    sources = load_results(tmp_path)
+    assert [source.path.split("/")[0] for source in sources] == ["with"]
+
+
+def test_sources_and_claims_are_listed(make_result: Any) -> None:
+    result = make_result("alpha", psnr=20.0, claimed={"psnr": 35.0})
+    row = Row((result,))
+    text = to_markdown([row], [Source("deep/alpha.json", result)])
+    assert "psnr: claimed 35, verified 20.00" in text
+    assert f"| deep/alpha.json | `{result.digests.scene[:12]}` | `{result.digests.submission[:12]}` |" in text
+
+
+def test_a_file_that_is_no_result_is_named(folder: Path, tmp_path: Path) -> None:
+    (folder / "notes.json").write_text('{"psnr": 99}')
+    with pytest.raises(SplashbenchError, match=r"notes.json: "):
+        load_results(folder)
+    with pytest.raises(SplashbenchError, match="holds no results"):
+        load_results(tmp_path / "empty")
