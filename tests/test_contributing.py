@@ -1,9 +1,11 @@
 """The method in CONTRIBUTING.md, run as it stands: a guide that no longer works fails here."""
 
+import inspect
 import re
 from pathlib import Path
 
 import pytest
+from splashbench_methods.hull_points import HullPoints
 
 from splashbench.adapter.runner import run_method
 from splashbench.scene import Scene
@@ -19,6 +21,8 @@ def test_the_method_in_the_guide_runs_and_beats_its_own_background(
         pytest.skip("CONTRIBUTING.md is not beside the tests")
     blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == 1
+    installed = Path(inspect.getfile(HullPoints))
+    assert blocks[0] == installed.read_text(encoding="utf-8"), "the guide shows another file than methods/hull_points"
     method = tmp_path / "hull_points.py"
     method.write_text(blocks[0], encoding="utf-8")
     submission = run_method(f"{method}:HullPoints", balls_directory, tmp_path / "out", timing_frames=0)

@@ -27,6 +27,7 @@ _RUNS: tuple[tuple[str, list[str]], ...] = (
     ("nothing", ["--preset", "quick"]),
     ("nearest_camera", []),
     ("oracle", []),
+    ("hull_points", []),
     ("splashsplat", ["--preset", "quick"]),
 )
 

@@ -1,0 +1,76 @@
+"""hull_points: points of the visual hull, coloured from the training views. The simplest method that is one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.observe import signed_distance_fields
+from splashbench.render import rasterize_arrays
+from splashbench.scene import Camera, Particles, TrainingScene
+
+
+class Settings(MethodConfig):
+    presets: ClassVar = {"best": {}, "quick": {"points": 2000}}  # the first one is the default
+    points: int = 8000  # per frame
+    cells: int = 64  # of the hull's grid, along its longest side
+
+
+class HullPoints(Method):
+    id = "hull_points"
+    title = "points of the visual hull, coloured from the training views"
+    Config = Settings
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Model:
+        rng = np.random.default_rng(run.seed)
+        fields = signed_distance_fields(scene, cells_longest_axis=config.cells)
+        positions = np.zeros((scene.n_frames, config.points, 3), np.float32)
+        active = np.zeros((scene.n_frames, config.points), bool)
+        colours = np.full((scene.n_frames, config.points, 3), 0.5, np.float32)
+        for t in range(scene.n_frames):
+            run.progress(t / scene.n_frames, "sampling the hull")
+            inside = np.argwhere(fields.phi[t] < 0)
+            if len(inside) == 0:
+                continue
+            cells = inside[rng.integers(0, len(inside), config.points)]
+            positions[t] = fields.origin + (cells + rng.uniform(-0.5, 0.5, cells.shape)) * fields.voxel
+            active[t] = True
+            seen = []
+            for name, camera in scene.cameras.items():
+                uv, _ = camera.project(positions[t])
+                column = np.clip(uv[:, 0].astype(int), 0, camera.width - 1)
+                row = np.clip(uv[:, 1].astype(int), 0, camera.height - 1)
+                seen.append(scene.image(name, t)[row, column] / 255.0)
+            colours[t] = np.median(seen, axis=0)
+        background = np.mean([scene.image(name, 0).mean(axis=(0, 1)) for name in scene.train], axis=0) / 255.0
+        return Model(scene.times, positions, active, colours, background, fields.voxel)
+
+    def load(self, directory: Path, scene: TrainingScene) -> Model:
+        with np.load(directory / "model.npz", allow_pickle=False) as data:
+            return Model(scene.times, *(data[name] for name in Model.ARRAYS))
+
+
+class Model(Fitted):
+    ARRAYS = ("positions", "active", "colours", "background", "radius")
+
+    def __init__(self, times, positions, active, colours, background, radius) -> None:  # type: ignore[no-untyped-def]
+        self.times, self.positions, self.active, self.colours = times, positions, active, colours
+        self.background, self.radius = background, float(radius)
+
+    def render(self, camera: Camera, time: float) -> Render:
+        t = int(np.abs(self.times - time).argmin())
+        shown = self.active[t]
+        n = int(shown.sum())
+        covariances = np.broadcast_to(np.eye(3, dtype=np.float32) * self.radius**2 / 4, (n, 3, 3))
+        opacities = np.full(n, 0.8, np.float32)
+        points, colours = self.positions[t][shown], self.colours[t][shown]
+        return Render(*rasterize_arrays(points, covariances, opacities, colours, camera, background=self.background))
+
+    def particles(self) -> Particles:
+        return Particles(self.positions, self.active)
+
+    def save(self, directory: Path) -> None:
+        np.savez(directory / "model.npz", **{name: getattr(self, name) for name in self.ARRAYS})

@@ -1,0 +1,218 @@
+"""The pieces of the static background: plates, seeds of anchors, the decoder, the losses."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from splashbench_methods.scaffold_gs.anchors import AnchorSeed, look_at, seed_anchors
+from splashbench_methods.scaffold_gs.losses import SsimTarget, l1, ssim
+from splashbench_methods.scaffold_gs.model import AnchorModel, rotation_matrices
+from splashbench_methods.scaffold_gs.plate import Plate, make_plate, masked_median
+
+from splashbench.scene import Camera
+
+
+def arc_camera(name: str, degrees: float, width: int = 80, height: int = 60) -> Camera:
+    """A camera on an arc of radius 5 around the origin, 25 degrees above the floor y = 0, looking at the origin."""
+    angle, elevation = np.radians(degrees), np.radians(25)
+    eye = 5 * np.array([np.sin(angle) * np.cos(elevation), np.sin(elevation), np.cos(angle) * np.cos(elevation)])
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 1, 0])
+    right /= np.linalg.norm(right)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ eye
+    return Camera(name, width, height, np.array([[90.0, 0, 42], [0, 90.0, 29], [0, 0, 1]]), w2c)
+
+
+def floor_points(camera: Camera) -> np.ndarray:
+    """Where each pixel's ray meets the floor, [H, W, 3] (every ray of these cameras does, or nearly)."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera.K).T @ camera.w2c[:3, :3]
+    reach = np.minimum(-camera.center[1] / np.minimum(rays[..., 1], -1e-3), 12.0)
+    return camera.center + reach[..., None] * rays
+
+
+def floor_color(points: np.ndarray) -> np.ndarray:
+    """A smooth bright pattern, uint8; nothing in it is darker than 80."""
+    x, z = points[..., 0], points[..., 2]
+    waves = [np.sin(2.2 * x) * np.cos(1.7 * z), np.sin(1.3 * x + 0.5), np.cos(1.9 * z - 0.3)]
+    return np.clip(150 + 60 * np.stack(waves, -1), 80, 255).astype(np.uint8)
+
+
+class TestPlate:
+    def test_median_is_over_the_dry_frames_only(self):
+        images = np.array([10, 20, 200, 30, 220], np.uint8)[:, None, None, None].repeat(3, axis=3)
+        dry = np.array([True, True, False, True, False])[:, None, None]
+        assert masked_median(images, dry).ravel().tolist() == [20, 20, 20]
+        assert masked_median(images, np.zeros_like(dry)).ravel().tolist() == [0, 0, 0]
+        assert masked_median(images, np.ones_like(dry)).ravel().tolist() == [30, 30, 30]
+
+    def test_a_passing_liquid_leaves_no_trace_and_a_lasting_one_no_evidence(self, passing_liquid):
+        scene, background = passing_liquid
+        plate = make_plate(scene, "1", longest_side=1000)
+        assert 0 < (~plate.seen).sum() < 200
+        assert not plate.seen[30, 40]
+        np.testing.assert_array_equal((plate.image[plate.seen] * 255).round(), background[plate.seen])
+
+    def test_shrinking_moves_the_camera_along(self, passing_liquid):
+        scene, background = passing_liquid
+        plate = make_plate(scene, "1", longest_side=40)
+        assert (plate.camera.width, plate.camera.height) == (40, 30)
+        np.testing.assert_allclose(plate.camera.K[:2], scene.cameras["1"].K[:2] / 2)
+        small = cv2.resize(background, (40, 30), interpolation=cv2.INTER_AREA) / 255
+        np.testing.assert_allclose(plate.image[plate.seen], small[plate.seen], atol=0.02)
+        assert (plate.image[~plate.seen] == 0).all()
+
+
+class _FakeScene:
+    """Three frames of one camera: a square of liquid that moves, and one that stays."""
+
+    def __init__(self) -> None:
+        camera = arc_camera("1", 0)
+        self.cameras, self.train, self.n_frames = {"1": camera}, ("1",), 3
+        self.background = floor_color(floor_points(camera))
+
+    def mask(self, name: str, t: int) -> np.ndarray:
+        mask = np.zeros(self.background.shape[:2], bool)
+        mask[10:20, 10 + 15 * t : 20 + 15 * t] = True
+        mask[28:33, 38:43] = True
+        return mask
+
+    def image(self, name: str, t: int) -> np.ndarray:
+        return np.where(self.mask(name, t)[..., None], np.array([20, 30, 250], np.uint8), self.background)
+
+
+@pytest.fixture
+def passing_liquid():
+    scene = _FakeScene()
+    return scene, scene.background
+
+
+def floor_plates() -> list[Plate]:
+    cameras = [arc_camera(str(i), degrees) for i, degrees in enumerate((-38, -19, 0, 19, 38))]
+    return [
+        Plate(c, floor_color(floor_points(c)).astype(np.float32) / 255, np.ones((c.height, c.width), bool))
+        for c in cameras
+    ]
+
+
+def sparse_floor(n: int = 300, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    points = np.zeros((n, 7), np.float32)
+    points[:, [0, 2]] = rng.uniform(-2.5, 2.5, (n, 2))
+    return points
+
+
+class TestAnchors:
+    def test_cameras_on_an_arc_look_at_its_centre(self):
+        cameras = [arc_camera(str(d), d).cropped(2, -1, 80, 60) for d in (-30, 0, 30)]
+        # Cropping moved the image centres onto the principal points, through which the optical axes run.
+        np.testing.assert_allclose(look_at(cameras), 0, atol=1e-4)
+
+    def test_pixels_are_lifted_onto_the_plane_of_the_sparse_points(self):
+        seed = seed_anchors(sparse_floor(), floor_plates(), 1500, np.random.default_rng(0))
+        near = np.linalg.norm(seed.positions, axis=1) < 2.5
+        assert near.sum() > 300
+        assert np.abs(seed.positions[near, 1]).max() < 0.05
+        expected = floor_color(seed.positions[near]).astype(float) / 255
+        assert np.abs(seed.colors[near] - expected).mean() < 0.05
+
+    @pytest.mark.parametrize("points", [sparse_floor(), sparse_floor(5), None], ids=["many", "few", "none"])
+    def test_seeds_are_bounded_finite_in_front_and_repeatable(self, points):
+        plates = floor_plates()
+        seed, again = (seed_anchors(points, plates, 400, np.random.default_rng(3)) for _ in range(2))
+        assert 100 < len(seed.positions) <= 400
+        for array, other in zip(vars(seed).values(), vars(again).values()):
+            assert np.isfinite(array).all()
+            np.testing.assert_array_equal(array, other)
+        assert (plates[2].camera.project(seed.positions)[1] > 0).all()
+        assert (seed.spacing > 0).all()
+
+    def test_points_on_one_line_and_points_at_infinity_do_no_harm(self):
+        line = np.zeros((50, 7), np.float32)
+        line[:, 0] = np.linspace(-1, 1, 50)
+        line[0, :3] = 1e7
+        seed = seed_anchors(line, floor_plates(), 400, np.random.default_rng(0))
+        assert np.isfinite(seed.positions).all()
+        assert np.median(np.linalg.norm(seed.positions, axis=1)) < 10
+
+
+class TestModel:
+    def model(self, n: int = 20) -> AnchorModel:
+        torch.manual_seed(0)
+        rng = np.random.default_rng(0)
+        seed = AnchorSeed(*(a.astype(np.float32) for a in (rng.normal(size=(n, 3)), rng.random((n, 3)), np.ones(n))))
+        return AnchorModel.from_seed(seed, children=3, view_dependent_shape=False)
+
+    def test_rotations_of_unnormalised_quaternions_are_rotations(self):
+        R = rotation_matrices(torch.randn(50, 4, generator=torch.Generator().manual_seed(0)) * 5).double()
+        np.testing.assert_allclose((R @ R.transpose(1, 2)).numpy(), np.eye(3)[None].repeat(50, 0), atol=1e-5)
+        np.testing.assert_allclose(torch.linalg.det(R), 1, atol=1e-5)
+        quarter = rotation_matrices(torch.tensor([[1.0, 0, 0, 1.0]]))[0]
+        np.testing.assert_allclose(quarter, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-6)
+
+    def test_children_start_near_their_anchor_with_its_colour(self):
+        model = self.model()
+        means, covariances, opacities, colors, scales = model.decode(np.array([0.0, 0, 9]))
+        assert means.shape == (60, 3)
+        assert (torch.linalg.norm(means.view(20, 3, 3) - model.positions[:, None], dim=2) < 1.3).all()
+        base = torch.sigmoid(model.features[:, :3])
+        assert (colors.view(20, 3, 3) - base[:, None]).abs().mean() < 0.1
+        assert (opacities > 0.3).all()
+        np.testing.assert_allclose(torch.linalg.det(covariances).detach(), scales.prod(1).detach() ** 2, rtol=1e-3)
+
+    def test_children_of_non_positive_opacity_are_not_drawn(self):
+        model = self.model()
+        with torch.no_grad():
+            model.opacity_head[-1].weight.zero_()
+            model.opacity_head[-1].bias.copy_(torch.tensor([0.5, -0.5, 0.25]))
+        means, _, opacities, _, _ = model.decode(np.zeros(3))
+        assert len(means) == 40
+        np.testing.assert_allclose(opacities[:2].detach(), np.tanh([0.5, 0.25]), rtol=1e-5)
+
+    def test_only_colour_depends_on_the_viewpoint_unless_asked(self):
+        model = self.model()
+        one, other = model.decode(np.array([0.0, 0, 9])), model.decode(np.array([9.0, 0, 0]))
+        assert all(torch.equal(one[i], other[i]) for i in (0, 1, 2))
+        assert not torch.equal(one[3], other[3])
+        model.view_dependent_shape = True
+        assert not torch.equal(model.decode(np.array([9.0, 0, 0]))[2], one[2])
+
+
+class TestLosses:
+    def images(self):
+        rng = np.random.default_rng(0)
+        image = rng.random((14, 17, 3)).astype(np.float32)
+        return image, np.clip(image + 0.2 * rng.normal(size=image.shape), 0, 1).astype(np.float32)
+
+    def test_an_image_is_wholly_similar_to_itself_and_noise_is_not(self):
+        image, noisy = self.images()
+        weight = np.ones(image.shape[:2], np.float32)
+        assert ssim(torch.tensor(image), SsimTarget(image, weight)).item() == pytest.approx(1, abs=1e-5)
+        assert ssim(torch.tensor(noisy), SsimTarget(image, weight)).item() < 0.95
+
+    def test_the_gradient_is_that_of_finite_differences(self):
+        image, noisy = self.images()
+        weight = np.ones(image.shape[:2], np.float32)
+        weight[3:6, 4:9] = 0
+        target = SsimTarget(image, weight)
+        direction = np.random.default_rng(1).normal(size=image.shape).astype(np.float32)
+        at = torch.tensor(noisy, requires_grad=True)
+        ssim(at, target).backward()
+        step = 1e-2
+        plus, minus = (ssim(torch.tensor(noisy + s * step * direction), target).item() for s in (1, -1))
+        analytic = float((at.grad * torch.tensor(direction)).sum())
+        assert analytic == pytest.approx((plus - minus) / (2 * step), rel=0.02)
+        assert (at.grad[3:6, 4:9] == 0).all()
+
+    def test_unseen_pixels_carry_no_loss(self):
+        image, other = self.images()
+        weight = np.zeros(image.shape[:2], np.float32)
+        weight[5, 5] = 1
+        expected = np.abs(image[5, 5] - other[5, 5]).mean()
+        got = l1(torch.tensor(image), torch.tensor(other), torch.tensor(weight)).item()
+        assert got == pytest.approx(expected, rel=1e-5)
+        assert l1(torch.tensor(image), torch.tensor(other), torch.zeros(14, 17)).item() == 0

@@ -1,0 +1,170 @@
+"""SplashSplat from images to images on balls in free flight, whose shape, place and times are known exactly."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.reconstruct import fit_liquid
+from splashbench_methods.splashsplat.subframe import locate, state_at
+
+from splashbench.adapter.contract import Run
+from splashbench.scene import Scene
+from splashbench.synth.balls import ball_centers
+
+TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
+
+
+@pytest.fixture(scope="module")
+def fitted(balls: Scene) -> FittedSplashSplat:
+    return SplashSplat().fit(balls.training(), SplashSplatConfig.preset("quick", TINY), Run(seed=1))
+
+
+def liquid_only(scene: Scene, seed: int = 1, **overrides: object) -> Liquid:
+    """The liquid over a grey background, without the time that a real background takes."""
+    training = scene.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+    config = SplashSplatConfig.preset("quick", TINY | {"iterations": 10} | overrides)
+    return fit_liquid(training, grey, config, Run(seed=seed))
+
+
+def test_it_beats_its_own_background_at_the_test_views(balls: Scene, fitted: FittedSplashSplat):
+    gains, overlaps = [], []
+    for name in balls.test:
+        camera = balls.cameras[name]
+        for t in range(balls.n_frames):
+            mask, truth = balls.mask(name, t), balls.image(name, t) / 255
+            render = fitted.render(camera, balls.times[t])
+            assert render.rgb.shape == (camera.height, camera.width, 3)
+            assert render.rgb.dtype == render.alpha.dtype == np.float32
+            assert render.rgb.min() >= 0
+            assert render.rgb.max() <= 1
+            errors = [((image - truth)[mask] ** 2).mean() for image in (render.rgb, fitted.background.render(camera))]
+            gains.append(10 * np.log10(errors[1] / errors[0]))
+            found = render.alpha > 0.5
+            overlaps.append((found & mask).sum() / (found | mask).sum())
+    assert np.mean(gains) > 4
+    assert np.mean(overlaps) > 0.75
+
+
+def test_a_saved_model_renders_the_same_image_in_a_fresh_process(
+    balls: Scene, balls_directory: Path, fitted: FittedSplashSplat, tmp_path: Path
+):
+    fitted.save(tmp_path)
+    name, times = balls.test[0], [float(balls.times[3]), 0.4 * balls.times[3] + 0.6 * balls.times[4]]
+    code = f"""
+import numpy as np
+from pathlib import Path
+from splashbench.scene import Scene
+from splashbench_methods.splashsplat import SplashSplat
+scene = Scene.open(Path({str(balls_directory)!r}))
+model = SplashSplat().load(Path({str(tmp_path)!r}), scene.training())
+views = [model.render(scene.cameras[{name!r}], time) for time in {times!r}]
+np.savez({str(tmp_path / "views.npz")!r}, rgb=[v.rgb for v in views], alpha=[v.alpha for v in views])
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+    views = np.load(tmp_path / "views.npz")
+    for i, time in enumerate(times):
+        here = fitted.render(balls.cameras[name], time)
+        np.testing.assert_array_equal(views["rgb"][i], here.rgb)
+        np.testing.assert_array_equal(views["alpha"][i], here.alpha)
+    assert (tmp_path / "static").is_dir()
+    assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} <= {".json", ".npz"}
+
+
+def test_particles_are_the_carriers_near_the_balls(balls: Scene, fitted: FittedSplashSplat):
+    particles = fitted.particles()
+    assert particles.positions.shape[0] == balls.n_frames
+    assert particles.active.any(axis=1).all()
+    for t in (0, 4, balls.n_frames - 1):
+        distance = np.linalg.norm(particles.at(t)[:, None] - ball_centers(balls.times[t]), axis=2).min(axis=1)
+        assert np.median(distance) < 0.12  # the largest ball's radius is 0.1
+    assert np.isfinite(particles.velocities).all()
+
+
+def test_particle_velocities_are_seconds_not_frames(balls: Scene, fitted: FittedSplashSplat):
+    particles = fitted.particles()
+    steps = np.diff(balls.times)
+    speeds = [np.linalg.norm(particles.velocities[t][particles.active[t]], axis=1) for t in range(len(steps))]
+    displacements = [speed * step / fitted.liquid.grid.voxel for speed, step in zip(speeds, steps)]
+    assert max(map(np.max, displacements)) <= 8.01  # the fit's limit, voxels a frame
+    assert 0.2 < np.median(np.concatenate(speeds)) < 3  # the balls fly at about a metre a second
+
+
+def test_between_frames_carriers_move_on_and_appearance_stays(balls: Scene, fitted: FittedSplashSplat):
+    liquid = fitted.liquid
+    start, stop = liquid.times[2], liquid.times[3]
+    ids, before = state_at(liquid, start)
+    later_ids, halfway = state_at(liquid, 0.5 * (start + stop))
+    _, later = state_at(liquid, 0.1 * start + 0.9 * stop)
+    assert torch.equal(ids, later_ids)
+    half, most = ((s.positions - before.positions).norm(dim=1) for s in (halfway, later))
+    assert float(half.mean()) > 0
+    assert float((most / half.clamp_min(1e-6)).median()) == pytest.approx(1.8, abs=0.1)
+    exact, _ = state_at(liquid, float(stop) + 1e-9)
+    np.testing.assert_array_equal(exact, liquid.carriers.ids[liquid.carriers.rows(3)])
+
+
+@pytest.mark.parametrize(
+    ("time", "frame", "fraction"),
+    [(-1, 0, 0), (0, 0, 0), (0.25, 0, 0.25), (1.0000001, 1, 0), (2.0, 1, 0.5), (2.9999999, 2, 0), (9, 2, 0)],
+)
+def test_times_are_located_on_uneven_steps(time, frame, fraction):
+    assert locate(np.array([0.0, 1.0, 3.0]), time) == (frame, pytest.approx(fraction))
+
+
+def test_the_same_seed_gives_the_same_liquid_bit_for_bit(balls: Scene):
+    first, second, other = liquid_only(balls), liquid_only(balls), liquid_only(balls, seed=2)
+    assert torch.equal(first.appearance.features, second.appearance.features)
+    np.testing.assert_array_equal(first.carriers.positions, second.carriers.positions)
+    np.testing.assert_array_equal(first.velocities, second.velocities)
+    assert not torch.equal(first.appearance.features[:100], other.appearance.features[:100])
+
+
+def test_the_ablations_differ_as_the_paper_says(balls: Scene):
+    full = liquid_only(balls, prune_opacity=0)
+    alone = liquid_only(balls, prune_opacity=0, variant="no_resampling")
+    anew = liquid_only(balls, prune_opacity=0, variant="per_frame")
+    last = balls.n_frames - 1
+    active = [np.diff(liquid.carriers.starts)[last] for liquid in (full, alone, anew)]
+    assert active[1] < 0.7 * active[0]  # without resampling carriers die out
+    assert full.carriers.count < 0.9 * anew.carriers.count  # transport stores fewer than reseeding
+    assert (anew.velocities == 0).all()
+
+
+def test_transparent_carriers_are_dropped(balls: Scene):
+    kept = liquid_only(balls, prune_opacity=0)
+    opacity = kept.appearance.decoder.mean_opacity(kept.appearance.features).detach()
+    strict = liquid_only(balls, prune_opacity=float(opacity.median()))
+    assert strict.carriers.count == pytest.approx(0.5 * kept.carriers.count, rel=0.05)
+    assert len(strict.appearance.features) == strict.carriers.count
+    assert strict.carriers.ids.max() == strict.carriers.count - 1
+
+
+def test_a_scene_without_masks_is_not_supported(balls: Scene):
+    training = balls.training()
+    training.mask = lambda camera, t: np.zeros((4, 4), dtype=bool)
+    support = SplashSplat().supports(training)
+    assert not support.ok
+    assert "liquid masks" in support.reason
+    assert SplashSplat().supports(balls.training()).ok
+
+
+def test_the_paper_preset_is_the_papers():
+    paper = SplashSplatConfig.preset("paper")
+    assert (paper.hull_cells, paper.transport_cells, paper.control_cells) == (176, 96, 24)
+    assert paper.control_factor == 4
+    assert (paper.iterations, paper.learning_rate_features, paper.learning_rate_heads) == (3000, 2e-3, 2e-3)
+    weights = paper.optimisation.weights
+    assert tuple(vars(weights).values()) == (0.5, 0.1, 0.2, 0.7, 0.01, 0.1, 1.0)
+    velocity = paper.velocity
+    assert (velocity.steps, velocity.step_size, velocity.band, velocity.limit) == (35, 0.45, 4.0, 8.0)
+    shell = paper.carriers.shell
+    assert (shell.min_per_cell, shell.max_per_cell, shell.depth) == (2, 5, 3.0)
+    assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)

@@ -1,0 +1,276 @@
+"""The whole of `splashbench prepare`: unusable recordings each give one line and no scene; a made-up session gives a scene.
+
+The clips here are tiny and show a moving square over a shared noise: enough for the clocks and the motion, not for a lens.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from splashbench import toml
+from splashbench.cli.main import main
+from splashbench.errors import SplashbenchError
+from splashbench.files import write_png
+from splashbench.prepare.pipeline import Options, prepare
+
+WIDTH, HEIGHT, FPS, RATE = 128, 72, 30, 48000
+CAMERAS = ("1", "2", "3")
+
+
+def write_clip(path: Path, seconds: float = 4.0, sound: np.ndarray | None = None, size=(WIDTH, HEIGHT)) -> None:
+    """A square that starts to fall after 1.5 s and stops after 3 s; `sound` float mono at 48 kHz, or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(5)
+    width, height = size
+    scenery = rng.integers(60, 180, (height // 4, width // 4, 3)).astype(np.uint8).repeat(4, 0).repeat(4, 1)
+    with av.open(str(path), "w", format="mp4") as container:
+        video = container.add_stream("libx264", rate=FPS, options={"crf": "12", "preset": "ultrafast"})
+        video.width, video.height, video.pix_fmt = width, height, "yuv420p"
+        track = container.add_stream("aac", rate=RATE, layout="mono") if sound is not None else None
+        for k in range(round(seconds * FPS)):
+            image = scenery.copy()
+            fallen = round(float(np.clip((k / FPS - 1.5) / 1.5, 0, 1)) * (height - 24))
+            if k / FPS > 1.5:
+                image[fallen : fallen + 20, 40:60] = (20, 40, 220)
+            for packet in video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+                container.mux(packet)
+        if track is not None:
+            for start in range(0, len(sound), 1024):
+                frame = av.AudioFrame.from_ndarray(sound[None, start : start + 1024], format="fltp", layout="mono")
+                frame.sample_rate, frame.pts, frame.time_base = RATE, start, Fraction(1, RATE)
+                for packet in track.encode(frame):
+                    container.mux(packet)
+        for stream in (video, *([track] if track is not None else [])):
+            for packet in stream.encode(None):
+                container.mux(packet)
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session that is well-formed, but whose board clips show no board."""
+    directory = tmp_path_factory.mktemp("session")
+    sound = (0.2 * np.random.default_rng(9).standard_normal(RATE * 5)).astype(np.float32)
+    recordings: dict[str, dict[str, list[str]]] = {"pour": {}, "static": {}, "intrinsics": {}}
+    for k, camera in enumerate(CAMERAS):
+        for kind in recordings:
+            name = f"cameras/{camera}/{kind}.MP4"
+            shift = 4000 * k
+            write_clip(
+                directory / name,
+                seconds=4.0 if kind == "pour" else 0.5,
+                sound=sound[shift : shift + 4 * RATE] if kind == "pour" else None,
+            )
+            recordings[kind][camera] = [name]
+    description = {
+        "schema_version": 1,
+        "name": "tiny",
+        "cameras": list(CAMERAS),
+        "train": ["1", "2"],
+        "test": ["3"],
+        "timesteps": 10,
+        "board": {
+            "squares_x": 8,
+            "squares_y": 5,
+            "square_metres": 0.03,
+            "marker_metres": 0.0225,
+            "dictionary": "DICT_4X4_50",
+        },
+        "recordings": recordings,
+    }
+    (directory / "session.toml").write_text(toml.dumps(description))
+    return directory
+
+
+@pytest.fixture
+def session(template: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(template, tmp_path / "session"))
+
+
+def edit(session: Path, **changes) -> None:
+    description = toml.load(session / "session.toml")
+    for key, value in changes.items():
+        if value is None:
+            del description[key]
+        else:
+            description[key] = value
+    (session / "session.toml").write_text(toml.dumps(description))
+
+
+def fails(session: Path, pattern: str, options: Options | None = None) -> None:
+    scene = session.parent / "scene"
+    with pytest.raises(SplashbenchError, match=pattern) as caught:
+        prepare(session, scene, options)
+    assert "\n" not in str(caught.value)
+    assert not scene.exists()
+    assert [path.name for path in session.parent.iterdir()] == ["session"]
+
+
+def test_a_clip_without_the_board_is_named(session: Path) -> None:
+    # Clocks and motion are found before, so this also shows that the rest of the session is sound.
+    fails(session, r"cameras/1/intrinsics\.MP4: the 8x5 ChArUco board is usable in 0 of 15 frames")
+
+
+def test_a_recording_without_sound_is_named(session: Path) -> None:
+    write_clip(session / "cameras/2/pour.MP4")
+    fails(session, r"cameras/2/pour\.MP4.*(sound|audio)")
+
+
+def test_a_silent_recording_is_named(session: Path) -> None:
+    write_clip(session / "cameras/2/pour.MP4", sound=np.zeros(4 * RATE, np.float32))
+    fails(session, r"cameras/2/pour\.MP4 \(camera 2\) cannot be synchronised: its audio is silent")
+
+
+def test_unrelated_sound_is_named(session: Path) -> None:
+    other = (0.2 * np.random.default_rng(77).standard_normal(4 * RATE)).astype(np.float32)
+    write_clip(session / "cameras/3/pour.MP4", sound=other)
+    fails(session, r"cameras/3/pour\.MP4 \(camera 3\) cannot be synchronised: its audio does not match")
+
+
+@pytest.mark.parametrize("kind", ["pour", "intrinsics"])
+def test_a_truncated_file_is_named(session: Path, kind: str) -> None:
+    path = session / f"cameras/1/{kind}.MP4"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    fails(session, rf"cameras/1/{kind}\.MP4")
+
+
+def test_a_missing_file_is_named(session: Path) -> None:
+    (session / "cameras/3/static.MP4").unlink()
+    fails(session, r"cameras/3/static\.MP4 .*does not exist")
+
+
+def test_a_camera_left_out_of_a_table_is_named(session: Path) -> None:
+    recordings = toml.load(session / "session.toml")["recordings"]
+    del recordings["pour"]["2"]
+    edit(session, recordings=recordings)
+    fails(session, r"session\.toml.*camera 2 has no entry in \[recordings\.pour\]")
+
+
+def test_recordings_that_calibration_needs_are_asked_for(session: Path) -> None:
+    recordings = toml.load(session / "session.toml")["recordings"]
+    edit(session, recordings={"pour": recordings["pour"], "intrinsics": recordings["intrinsics"]})
+    fails(session, r"session\.toml: camera 1 has no static recording")
+    edit(session, recordings={"pour": recordings["pour"]}, board=None)
+    fails(session, r"session\.toml: no \[board\]")
+
+
+def test_a_folder_that_is_no_session(session: Path) -> None:
+    (session / "session.toml").unlink()
+    fails(session, r"session\.toml does not exist")
+
+
+def test_an_existing_scene_is_kept_unless_told_otherwise(session: Path) -> None:
+    scene = session.parent / "scene"
+    scene.mkdir()
+    (scene / "notes.txt").write_text("mine")
+    with pytest.raises(SplashbenchError, match="exists already"):
+        prepare(session, scene)
+    with pytest.raises(SplashbenchError, match="ChArUco"):
+        prepare(session, scene, Options(replace=True))
+    assert (scene / "notes.txt").read_text() == "mine"
+
+
+def test_command_line_exit_statuses(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = str(session.parent / "scene")
+    assert main(["prepare", str(session), scene]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("error: ")
+    assert main(["prepare", str(session), scene, "--interval", "3", "2"]) == 1
+    assert "START must come before END" in capsys.readouterr().err
+    for wrong in (["--timesteps", "1"], ["--interval", "1"], ["--image-format", "bmp"]):
+        with pytest.raises(SystemExit) as caught:
+            main(["prepare", str(session), scene, *wrong])
+        assert caught.value.code == 2
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as caught:
+        main(["prepare", "--help"])
+    assert caught.value.code == 0
+    assert "splashbench prepare sessions/monday scenes/monday" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def made_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A made-up session with exact ground truth, smaller than the default."""
+    directory = tmp_path_factory.mktemp("made_up") / "session"
+    assert main(["synth", "session", str(directory), "--fps", "30", "--particle-radius", "0.004"]) == 0
+    return directory
+
+
+@pytest.mark.slow
+def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
+    from splashbench.scene import Scene
+
+    out = tmp_path / "scene"
+    preparation = prepare(made_up, out, Options(timesteps=20))
+    assert [gate.name for gate in preparation.warnings] == []
+    scene = Scene.open(out)
+    assert scene.n_frames == 20
+    assert (scene.train, scene.test) == (("1", "2", "3", "4", "5"), ("6", "7"))
+    assert scene.metres_per_unit == 1.0
+    np.testing.assert_allclose(scene.gravity, [0.0, -1.0, 0.0])
+    assert scene.initial_points().shape[1] == 7
+    for camera in scene.cameras.values():
+        assert camera.width % 8 == 0
+        assert scene.image(camera.name, 10).shape == (camera.height, camera.width, 3)
+        assert scene.mask(camera.name, 10).any()
+
+    truth = json.loads((made_up / "truth/truth.json").read_text())
+    report = json.loads((out / "prepare_report.json").read_text())
+    for camera, known in truth["cameras"].items():
+        focal = np.array(report["intrinsics"][camera]["K"])[[0, 1], [0, 1]]
+        np.testing.assert_allclose(focal, np.array(known["K"])[[0, 1], [0, 1]], rtol=0.01)
+        clock = report["sync"][camera]
+        for local in (1.0, 3.0):
+            found = clock["start_s"] + clock["clock_rate"] * local
+            assert abs(found - known["start_s"] - known["clock_rate"] * local) < 1e-3
+    # Distances between cameras need no common frame.
+    found, known = (
+        np.array([_centre(matrices[camera]["w2c"]) for camera in truth["cameras"]])
+        for matrices in (report["poses"], truth["cameras"])
+    )
+    spans = [np.linalg.norm(centres[:, None] - centres[None], axis=-1).sum() for centres in (found, known)]
+    assert abs(spans[0] / spans[1] - 1) < 0.005
+    page = (out / "prepare_report.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/jpeg;base64,") == 21
+    assert "http" not in page
+
+
+@pytest.mark.slow
+def test_a_folder_of_masks_whole_frames_and_a_given_interval(made_up: Path, tmp_path: Path) -> None:
+    from splashbench.scene import Scene
+
+    options = Options(
+        masks=str(made_up / "truth/masks"), timesteps=5, interval=(2.2, 3.0), crop=False, image_format="jpg"
+    )
+    prepare(made_up, tmp_path / "scene", options)
+    scene = Scene.open(tmp_path / "scene")
+    assert {(camera.width, camera.height) for camera in scene.cameras.values()} == {(480, 270)}
+    assert (tmp_path / "scene/ims/1/000004.jpg").is_file()
+    np.testing.assert_allclose(scene.times[[0, -1]], [2.2, 3.0], atol=0.02)
+
+
+@pytest.mark.slow
+def test_a_camera_that_cannot_be_posed_is_named(made_up: Path, tmp_path: Path) -> None:
+    session = Path(shutil.copytree(made_up, tmp_path / "session"))
+    static = toml.load(session / "session.toml")["recordings"]["static"]["4"][0]
+    write_clip(session / static, seconds=0.5, size=(480, 270))  # something else altogether
+    fails(session, "no pose for camera 4;")
+
+
+def _centre(w2c: list[list[float]]) -> np.ndarray:
+    matrix = np.array(w2c)
+    return -matrix[:3, :3].T @ matrix[:3, 3]
+
+
+def test_masks_folder_option_must_be_a_folder(session: Path, tmp_path: Path) -> None:
+    write_png(tmp_path / "masks.png", np.zeros((4, 4), np.uint8))
+    from splashbench.prepare.masking import choose_provider
+
+    with pytest.raises(SplashbenchError, match=r"masks\.png is not a folder of masks"):
+        choose_provider(tmp_path / "masks.png", {}, {}, 0.0)

@@ -1,0 +1,23 @@
+"""A small made-up session, made once for all tests that look at one."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from splashbench.synth.plan import Options
+
+SMALL = Options(size=(128, 72), fps=20, seed=3, duration=0.7, particle_radius=0.005)
+
+
+@pytest.fixture(scope="session")
+def small_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole session of tiny frames and coarse liquid."""
+    for module in ("pysplishsplash", "pysplashsurf", "embreex"):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed (splashbench[synth])")
+    from splashbench.synth.session import make_session
+
+    return make_session(tmp_path_factory.mktemp("synth") / "session", SMALL)
