@@ -1,0 +1,91 @@
+"""The control `nearest_camera`: the closest training view's image and mask, warped to the test view.
+
+The warp is the homography of one plane: through the point that all training cameras look at, facing the test camera.
+It is exact there, and wrong elsewhere by the parallax a reconstruction exists to get right.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from splashbench_methods.scaffold_gs.anchors import look_at
+
+from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.files import write_json
+from splashbench.scene import Camera, Particles, TrainingScene
+
+
+class NearestCamera(Method):
+    """Copies the nearest training view at the nearest time."""
+
+    id: ClassVar[str] = "nearest_camera"
+    title: ClassVar[str] = "control: nearest training view"
+    Config: ClassVar[type[MethodConfig]] = MethodConfig
+    control: ClassVar[bool] = True
+
+    def fit(self, scene: TrainingScene, config: MethodConfig, run: Run) -> Fitted:
+        return NearestView(scene)
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        return NearestView(scene)
+
+
+class NearestView(Fitted):
+    """Looks the images up in the scene itself; nothing is learned, so nothing but a note is saved."""
+
+    def __init__(self, scene: TrainingScene) -> None:
+        self.scene = scene
+        self.center = look_at(list(scene.cameras.values()))
+
+    def source(self, camera: Camera) -> Camera:
+        """The training camera that sees the scene's centre from the most similar direction."""
+        wanted = _direction(camera.center, self.center)
+        return max(self.scene.cameras.values(), key=lambda c: float(wanted @ _direction(c.center, self.center)))
+
+    def render(self, camera: Camera, time: float) -> Render:
+        source = self.source(camera)
+        t = int(np.abs(self.scene.camera_times[source.name] - time).argmin())
+        warp = _pixel_centres(homography(camera, source, self.center))
+        size = (camera.width, camera.height)
+        image, mask = (
+            cv2.warpPerspective(
+                layer.astype(np.float32), warp, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=border
+            )
+            for layer, border in (
+                (self.scene.image(source.name, t), cv2.BORDER_REPLICATE),
+                (self.scene.mask(source.name, t), cv2.BORDER_CONSTANT),
+            )
+        )
+        return Render(np.clip(image / 255, 0, 1).astype(np.float32), np.clip(mask, 0, 1).astype(np.float32))
+
+    def particles(self) -> Particles | None:
+        return None
+
+    def save(self, directory: Path) -> None:
+        write_json(directory / "nearest_camera.json", {"center": self.center.tolist()})
+
+
+def _direction(eye: NDArray, target: NDArray) -> NDArray:
+    offset = np.asarray(target) - np.asarray(eye)
+    return offset / max(float(np.linalg.norm(offset)), 1e-12)
+
+
+def homography(target: Camera, source: Camera, point: NDArray) -> NDArray[np.float64]:
+    """Pixels of `target` to pixels of `source`, [3, 3], over the plane through `point` that faces `target`.
+
+    Where the point does not lie before the target camera, the plane at infinity is taken.
+    """
+    relative = source.w2c @ np.linalg.inv(target.w2c)
+    depth = float(target.w2c[2, :3] @ point + target.w2c[2, 3])
+    shift = np.outer(relative[:3, 3], [0.0, 0.0, 1.0]) / depth if depth > 1e-9 else np.zeros((3, 3))
+    return np.asarray(source.K @ (relative[:3, :3] + shift) @ np.linalg.inv(target.K))
+
+
+def _pixel_centres(matrix: NDArray) -> NDArray:
+    """The same map for OpenCV, whose pixel centres lie at whole numbers instead of +0.5."""
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    return np.asarray(np.linalg.inv(half) @ matrix @ half)

@@ -1,0 +1,7 @@
+"""Static Scaffold-GS anchors: the background of other methods (`fit_background`, `Background`), and a method itself."""
+
+from splashbench_methods.scaffold_gs.background import Background, fit_background
+from splashbench_methods.scaffold_gs.method import ScaffoldGS, StaticScene
+from splashbench_methods.scaffold_gs.settings import BackgroundSettings
+
+__all__ = ["Background", "BackgroundSettings", "ScaffoldGS", "StaticScene", "fit_background"]

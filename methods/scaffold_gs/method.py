@@ -1,0 +1,43 @@
+"""Scaffold-GS as a method of its own: a static reconstruction that knows no liquid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from splashbench_methods.scaffold_gs.background import Background, fit_background
+from splashbench_methods.scaffold_gs.settings import BackgroundSettings
+
+from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.scene import Camera, Particles, TrainingScene
+
+
+class StaticScene(Fitted):
+    """A background alone: the same at every time, with a liquid opacity of zero everywhere."""
+
+    def __init__(self, background: Background) -> None:
+        self.background = background
+
+    def render(self, camera: Camera, time: float) -> Render:
+        return Render(self.background.render(camera), np.zeros((camera.height, camera.width), np.float32))
+
+    def particles(self) -> Particles | None:
+        return None
+
+    def save(self, directory: Path) -> None:
+        self.background.save(directory / "static")
+
+
+class ScaffoldGS(Method):
+    """Static anchors fitted to the liquid-free plates (Lu et al., CVPR 2024)."""
+
+    id: ClassVar[str] = "scaffold_gs"
+    title: ClassVar[str] = "Scaffold-GS, static"
+    Config: ClassVar[type[MethodConfig]] = BackgroundSettings
+
+    def fit(self, scene: TrainingScene, config: BackgroundSettings, run: Run) -> Fitted:
+        return StaticScene(fit_background(scene, config, run))
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        return StaticScene(Background.load(directory / "static"))
