@@ -1,0 +1,1 @@
+"""Made-up recordings and scenes with exact ground truth: simulation, filming, sound, and what a preparation got right."""

@@ -92,7 +92,8 @@ def _camera(name: str, place: int, size: tuple[int, int]) -> Camera:
     width, height = size
     focal = 1.5 * width
     # Off-centre, as in a crop: a method that ignores the principal point is found out.
-    return Camera(name, width, height, np.array([[focal, 0, 0.48 * width], [0, focal, 0.53 * height], [0, 0, 1]]), w2c)
+    K = np.array([[focal, 0, 0.48 * width], [0, focal, 0.53 * height], [0, 0, 1]])
+    return Camera(name, width, height, K, w2c)
 
 
 def _frames(
