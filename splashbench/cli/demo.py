@@ -71,8 +71,10 @@ def run(arguments: argparse.Namespace) -> int:
     steps.run(
         "score them",
         sheet,
-        ["score", *map(str, runs.values()), "--scene", str(scene), "--out", str(results)]
-        + ["--reference", str(runs["nothing"]), "--sheet", str(sheet)],
+        [
+            *("score", *map(str, runs.values()), "--scene", str(scene), "--out", str(results)),
+            *("--reference", str(runs["nothing"]), "--sheet", str(sheet)),
+        ],
         stale=(results,),
     )
     steps.always("draw the leaderboard", ["leaderboard", str(results), str(out / "leaderboard")])

@@ -1,1 +1,1 @@
-"""Made-up recordings and scenes with exact ground truth: simulation, filming, sound, and what a preparation got right."""
+"""Made-up recordings and scenes with exact ground truth, and what a preparation made of them."""

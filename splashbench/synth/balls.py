@@ -75,7 +75,8 @@ def truth_particles(times: NDArray[np.float64], rng: np.random.Generator, per_ba
     positions = np.stack([(ball_centers(t)[:, None] + offsets).reshape(-1, 3) for t in times])
     falling = np.array([0.0, -GRAVITY, 0.0])
     velocities = np.stack([np.repeat(_VELOCITIES + falling * t, per_ball, axis=0) for t in times])
-    return Particles(positions.astype(np.float32), np.ones(positions.shape[:2], dtype=bool), velocities.astype(np.float32))
+    active = np.ones(positions.shape[:2], dtype=bool)
+    return Particles(positions.astype(np.float32), active, velocities.astype(np.float32))
 
 
 def _camera(name: str, place: int, size: tuple[int, int]) -> Camera:

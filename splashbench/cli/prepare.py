@@ -1,0 +1,98 @@
+"""`splashbench prepare SESSION SCENE`: a raw recording to a calibrated, synchronised, masked and cropped scene."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splashbench.cli.output import add_json, emit, say, table
+
+_EPILOG = """\
+examples:
+  splashbench prepare sessions/monday scenes/monday
+  splashbench prepare sessions/monday scenes/monday --masks sam3_masks --interval 12.4 17.7 --replace
+
+SESSION holds session.toml and the cameras' own files: per camera a clip of the ChArUco board, one of the textured
+static scene with the board lying flat on the table, and the pour with sound; and a handheld sweep of the static scene.
+SCENE appears only when every essential gate is passed; its prepare_report.html shows what was found.
+"""
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = subparsers.add_parser(
+        "prepare",
+        help="make a scene from raw recordings",
+        description="Calibrate, synchronise, sample, mask, undistort and crop the recordings of SESSION into SCENE.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("session", type=Path, metavar="SESSION", help="folder with session.toml")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder to be made")
+    parser.add_argument(
+        "--masks",
+        metavar="background|FOLDER",
+        help="liquid masks: by background subtraction, or FOLDER/<camera>/<source frame:06d>.png of the raw frames;"
+        " default: as session.toml says",
+    )
+    parser.add_argument("--timesteps", type=_at_least_two, metavar="N", help="timesteps; default: as session.toml says")
+    parser.add_argument(
+        "--interval",
+        nargs=2,
+        type=float,
+        metavar=("START", "END"),
+        help="motion interval in seconds on the first camera's clock; default: found in the images",
+    )
+    parser.add_argument("--no-crop", action="store_true", help="keep whole frames instead of the paper's crop")
+    parser.add_argument("--image-format", choices=("png", "jpg"), default="png", help="of the frames (default: png)")
+    parser.add_argument("--replace", action="store_true", help="replace SCENE where it exists")
+    add_json(parser)
+    parser.set_defaults(handler=run)
+
+
+def _at_least_two(text: str) -> int:
+    value = int(text)
+    if value < 2:
+        raise argparse.ArgumentTypeError("at least two timesteps make a motion")
+    return value
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench prepare`."""
+    from splashbench.errors import SplashbenchError
+    from splashbench.prepare.pipeline import Options, prepare
+
+    interval = None
+    if arguments.interval is not None:
+        interval = (arguments.interval[0], arguments.interval[1])
+        if not interval[0] < interval[1]:
+            raise SplashbenchError(f"--interval {interval[0]} {interval[1]}: START must come before END")
+    options = Options(
+        masks=arguments.masks,
+        timesteps=arguments.timesteps,
+        interval=interval,
+        crop=not arguments.no_crop,
+        replace=arguments.replace,
+        image_format=arguments.image_format,
+    )
+    try:
+        preparation = prepare(arguments.session, arguments.scene, options)
+    except SplashbenchError as error:
+        # The traceback holds the progress bar that was running; without it the bar ends its line before the error's.
+        raise error.with_traceback(None) from None
+    rows = [
+        [gate.name, _figure(gate.value), f"{gate.side} {gate.limit:.4g}", "passed" if gate.passed else "WARNING"]
+        for gate in preparation.gates
+    ]
+    say(table(["gate", "value", "limit", "outcome"], rows))
+    for gate in preparation.warnings:
+        say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}")
+    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in preparation.stages.items())
+    say(f"wrote {arguments.scene} in {sum(preparation.stages.values()):.0f} s ({spent})")
+    if arguments.json:
+        emit({"scene": str(arguments.scene), "passed": not preparation.warnings, **preparation.as_json()})
+    return 0
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
