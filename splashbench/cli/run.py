@@ -69,7 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
         emit(submission.identity.model_dump(mode="json") | record.model_dump(mode="json"))
     if record.status.value != "ok":
         say(
-            f"error: {submission.identity.method}: {record.status.value}: {record.reason}; see {arguments.out}/record.json"
+            f"error: {submission.identity.method}: {record.status.value}: {record.reason}; "
+            f"see {arguments.out / 'record.json'}"
         )
         return 1
     cost = f", fit in {record.fit_seconds:.1f} s" if record.fit_seconds is not None else ""

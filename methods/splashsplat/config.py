@@ -1,0 +1,170 @@
+"""Settings of SplashSplat and its presets.
+
+"paper" is the supplement's "Implementation Details"; "best" departs from it where that was measured to help; "quick"
+is for a first look within minutes. The paper's ablations are `variant` and `separation_weight=0`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt
+from splashbench_methods.splashsplat.carriers import CarrierSettings, Variant
+from splashbench_methods.splashsplat.decoder import DecoderSettings
+from splashbench_methods.splashsplat.fit import FitSettings
+from splashbench_methods.splashsplat.losses import LossWeights
+from splashbench_methods.splashsplat.resample import ShellSettings
+from splashbench_methods.splashsplat.velocity import VelocitySettings
+
+from splashbench.adapter.contract import MethodConfig
+from splashbench.observe.signed_distance import DistanceMethod
+
+if TYPE_CHECKING:
+    from splashbench_methods.scaffold_gs import BackgroundSettings
+
+
+class SplashSplatConfig(MethodConfig):
+    """Settings of SplashSplat. Lengths are in transport voxels; *_cells counts cells along the longest side."""
+
+    # Observation fields
+    hull_cells: int = Field(224, ge=16, le=512)
+    transport_cells: int = Field(112, ge=16, le=256)
+    control_cells: int = Field(28, ge=4, le=128)
+    distance: DistanceMethod = "silhouette"
+    # Velocity
+    velocity_steps: int = Field(35, ge=0)
+    velocity_step_size: PositiveFloat = 0.45
+    velocity_band: PositiveFloat = 4.0
+    velocity_smoothing: float = Field(0.6, ge=0)
+    velocity_smooth: Literal["update", "field"] = "update"
+    projection_blend: float = Field(0.35, ge=0, le=1)
+    velocity_limit: PositiveFloat = 8.0
+    # Carriers
+    variant: Variant = "full"
+    correction: PositiveFloat = 1.0
+    kill_outside: PositiveFloat = 0.5
+    kill_inside: float | None = Field(-3.0, lt=0)
+    cell_capacity: PositiveInt | None = 6
+    shell_depth: PositiveFloat = 1.5
+    min_per_cell: PositiveInt = 2
+    max_per_cell: PositiveInt = 4
+    # Decoder
+    feature_size: PositiveInt = 32
+    children: int = Field(2, ge=1, le=6)
+    base_scale: PositiveFloat = 0.35
+    # Optimisation
+    iterations: int = Field(2000, ge=0)
+    learning_rate_features: PositiveFloat = 1e-2
+    learning_rate_heads: PositiveFloat = 5e-3
+    learning_rate_scales: PositiveFloat = 1e-2
+    anneal: bool = True
+    ssim_every: PositiveInt = 1
+    silhouette_norm: Literal["image", "mask"] = "image"
+    foreground_weight: float = Field(0.5, ge=0)
+    gradient_weight: float = Field(0.1, ge=0)
+    ssim_weight: float = Field(0.2, ge=0)
+    silhouette_weight: float = Field(0.7, ge=0)
+    covariance_weight: float = Field(0.01, ge=0)
+    separation_weight: float = Field(0.1, ge=0)
+    colour_weight: float = Field(1.0, ge=0)
+    #: carriers whose learned opacity ends below this are dropped; 0 keeps all
+    prune_opacity: float = Field(0.05, ge=0, lt=1)
+    # Background, fitted by scaffold_gs: its preset
+    background_preset: Literal["best", "paper", "quick"] = "best"
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "best": {},
+        "paper": {
+            "hull_cells": 176,
+            "transport_cells": 96,
+            "control_cells": 24,
+            "distance": "carve",
+            "velocity_smooth": "field",
+            "kill_inside": None,
+            "cell_capacity": None,
+            "shell_depth": 3.0,
+            "max_per_cell": 5,
+            "base_scale": 0.7,
+            "iterations": 3000,
+            "learning_rate_features": 2e-3,
+            "learning_rate_heads": 2e-3,
+            "learning_rate_scales": 2e-3,
+            "anneal": False,
+            "prune_opacity": 0.0,
+            "background_preset": "paper",
+        },
+        "quick": {
+            "hull_cells": 160,
+            "transport_cells": 80,
+            "control_cells": 20,
+            "cell_capacity": 4,
+            "max_per_cell": 2,
+            "iterations": 800,
+            "ssim_every": 2,
+            "background_preset": "quick",
+        },
+    }
+
+    @property
+    def control_factor(self) -> int:
+        """Transport voxels per control cell."""
+        return max(1, round(self.transport_cells / self.control_cells))
+
+    @property
+    def background(self) -> BackgroundSettings:
+        from splashbench_methods.scaffold_gs import BackgroundSettings
+
+        return BackgroundSettings.model_validate(BackgroundSettings.presets[self.background_preset])
+
+    @property
+    def velocity(self) -> VelocitySettings:
+        return VelocitySettings(
+            steps=self.velocity_steps,
+            step_size=self.velocity_step_size,
+            band=self.velocity_band,
+            smoothing=self.velocity_smoothing,
+            smooth=self.velocity_smooth,
+            projection_blend=self.projection_blend,
+            limit=self.velocity_limit,
+        )
+
+    @property
+    def carriers(self) -> CarrierSettings:
+        return CarrierSettings(
+            variant=self.variant,
+            correction=self.correction,
+            kill_outside=self.kill_outside,
+            kill_inside=self.kill_inside,
+            cell_capacity=self.cell_capacity,
+            shell=ShellSettings(
+                depth=self.shell_depth,
+                min_per_cell=self.min_per_cell,
+                max_per_cell=max(self.min_per_cell, self.max_per_cell),
+            ),
+        )
+
+    @property
+    def decoder(self) -> DecoderSettings:
+        return DecoderSettings(feature_size=self.feature_size, children=self.children)
+
+    @property
+    def optimisation(self) -> FitSettings:
+        return FitSettings(
+            iterations=self.iterations,
+            learning_rate_features=self.learning_rate_features,
+            learning_rate_heads=self.learning_rate_heads,
+            learning_rate_scales=self.learning_rate_scales,
+            anneal=self.anneal,
+            ssim_every=self.ssim_every,
+            base_scale=self.base_scale,
+            weights=LossWeights(
+                foreground=self.foreground_weight,
+                gradient=self.gradient_weight,
+                ssim=self.ssim_weight,
+                silhouette=self.silhouette_weight,
+                covariance=self.covariance_weight,
+                separation=self.separation_weight,
+                colour=self.colour_weight,
+            ),
+        )

@@ -1,0 +1,100 @@
+"""The method SplashSplat by the harness's contract (paper, "Method"): observe, track, decode, render."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import torch
+from splashbench_methods.splashsplat.config import SplashSplatConfig
+from splashbench_methods.splashsplat.fit import composite
+from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.reconstruct import fit_liquid
+from splashbench_methods.splashsplat.subframe import state_at
+from splashbench_methods.splashsplat.threads import one_torch_thread
+
+from splashbench.adapter.contract import Fitted, Method, Render, Run, Support
+from splashbench.scene.camera import Camera
+from splashbench.scene.particles import Particles
+from splashbench.scene.scene import TrainingScene
+
+if TYPE_CHECKING:
+    from splashbench_methods.scaffold_gs import Background
+
+MIN_VIEWS = 2
+# Share of the time that the background takes, for the progress bar only.
+_BACKGROUND = 0.25
+
+
+class FittedSplashSplat(Fitted):
+    """Liquid over a frozen background. The liquid lies in front: there is no depth order between the two yet."""
+
+    def __init__(self, liquid: Liquid, background: Background) -> None:
+        self.liquid = liquid
+        self.background = background
+        self._background_image: tuple[Camera, np.ndarray] | None = None
+
+    def _background(self, camera: Camera) -> np.ndarray:
+        # Videos ask for one camera many times in a row, and nothing in the background moves.
+        if self._background_image is None or self._background_image[0] is not camera:
+            self._background_image = camera, np.asarray(self.background.render(camera), dtype=np.float32)
+        return self._background_image[1]
+
+    @torch.no_grad()
+    def render(self, camera: Camera, time: float) -> Render:
+        """The view of `camera` at `time` (seconds), any time: between frames the carriers are advected."""
+        background = torch.from_numpy(self._background(camera))
+        ids, state = state_at(self.liquid, time)
+        if len(ids) == 0:
+            return Render(background.numpy().copy(), np.zeros(background.shape[:2], dtype=np.float32))
+        look = self.liquid.appearance
+        eye = torch.tensor(camera.center, dtype=torch.float32)
+        with one_torch_thread():
+            children = look.decoder(look.features[ids], look.log_scales[ids], state, eye)
+            rgb, alpha = composite(children, camera, background)
+            return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
+
+    def particles(self) -> Particles:
+        """The carriers."""
+        return self.liquid.particles()
+
+    def save(self, directory: Path) -> None:
+        """The liquid's files, and the background under static/."""
+        self.liquid.save(directory)
+        static = directory / "static"
+        static.mkdir(exist_ok=True)
+        self.background.save(static)
+
+
+class SplashSplat(Method):
+    """Carriers moved by a fitted velocity field, corrected and refilled by the hull, decoded into Gaussians."""
+
+    id: ClassVar[str] = "splashsplat"
+    title: ClassVar[str] = "SplashSplat"
+    Config = SplashSplatConfig
+
+    def supports(self, scene: TrainingScene) -> Support:
+        """Needs liquid masks in two training views."""
+        seeing = [name for name in scene.train if any(scene.mask(name, t).any() for t in range(scene.n_frames))]
+        if len(seeing) < MIN_VIEWS:
+            return Support(False, f"needs liquid masks in {MIN_VIEWS} training views, and has {len(seeing)}")
+        return Support(True)
+
+    def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
+        """Background, observation fields, carriers, appearance, in that order."""
+        from splashbench_methods.scaffold_gs import fit_background
+
+        with one_torch_thread():
+            background = fit_background(scene, config.background, run, span=(0, _BACKGROUND))
+        images = {
+            name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()
+        }
+        liquid = fit_liquid(scene, images, config, run, span=(_BACKGROUND, 1))
+        return FittedSplashSplat(liquid, background)
+
+    def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
+        """Read a saved model."""
+        from splashbench_methods.scaffold_gs import Background
+
+        return FittedSplashSplat(Liquid.load(directory), Background.load(directory / "static"))

@@ -1,0 +1,178 @@
+"""The liquid as fitted: carriers, motion, signed distance and appearance, with its files.
+
+Everything is held in the precision in which it is stored, so that a loaded model renders the same image, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from splashbench_methods.splashsplat.carriers import Carriers
+from splashbench_methods.splashsplat.decoder import Decoder, DecoderSettings
+from splashbench_methods.splashsplat.fit import Appearance
+from splashbench_methods.splashsplat.transport import forecast
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import read_json, read_npz, write_json
+from splashbench.observe.grid import Grid
+from splashbench.scene.particles import Particles
+
+FORMAT = 1
+# phi is needed between frames only and matters within a few voxels of the interface: 1/16 voxel, up to +-7.9 voxels.
+PHI_STEPS_PER_VOXEL = 16
+
+
+def _position_steps(grid: Grid) -> float:
+    """16-bit steps per transport voxel."""
+    return 65535 / max(grid.shape)
+
+
+def store_precision(carriers: Carriers, grid: Grid) -> Carriers:
+    """Carriers rounded to what the files hold: 16-bit fixed-point positions, half-precision F and phi."""
+    steps = _position_steps(grid)
+    positions = np.round(np.clip(carriers.positions * steps, 0, 65535)) / np.float32(steps)
+    return replace(
+        carriers,
+        positions=positions.astype(np.float32),
+        deformation=carriers.deformation.astype(np.float16).astype(np.float32),
+        phi=carriers.phi.astype(np.float16).astype(np.float32),
+    )
+
+
+def pack_phi(phi: np.ndarray) -> np.ndarray:
+    """Signed distance in voxels to int8."""
+    return np.round(np.clip(phi * PHI_STEPS_PER_VOXEL, -127, 127)).astype(np.int8)
+
+
+@dataclass
+class Liquid:
+    """The dynamic foreground.
+
+    times: [T] seconds. grid: the transport grid. carriers: in store precision. velocities: float16 [T - 1, cx, cy,
+    cz, 3], voxels per frame. factor: transport voxels per control cell. phi: int8 [T, nx, ny, nz], see `pack_phi`.
+    """
+
+    times: np.ndarray
+    grid: Grid
+    carriers: Carriers
+    velocities: np.ndarray
+    factor: int
+    phi: np.ndarray
+    appearance: Appearance
+
+    @classmethod
+    def of(
+        cls,
+        times: np.ndarray,
+        grid: Grid,
+        carriers: Carriers,
+        velocities: np.ndarray,
+        factor: int,
+        phi: np.ndarray,
+        appearance: Appearance,
+    ) -> Liquid:
+        """Bring the learned tables and velocities to the precision of the files."""
+        halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
+        appearance = Appearance(halves[0], halves[1], appearance.decoder)
+        return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance)
+
+    def particles(self) -> Particles:
+        """The carriers as particles; velocities are the displacements to the next frame over the true time step."""
+        n_frames, count = self.carriers.n_frames, self.carriers.count
+        positions = np.zeros((n_frames, count, 3), dtype=np.float32)
+        velocities = np.zeros_like(positions)
+        active = np.zeros((n_frames, count), dtype=bool)
+        for t in range(n_frames):
+            rows = self.carriers.rows(t)
+            ids = self.carriers.ids[rows]
+            x, F = self.carriers.positions[rows], self.carriers.deformation[rows]
+            positions[t, ids] = self.grid.to_scene(x)
+            active[t, ids] = True
+            if n_frames > 1 and len(ids):
+                step = min(t, n_frames - 2)  # the last frame has no step of its own
+                moved, _ = forecast(self.velocities[step].astype(np.float32), self.factor, x, F)
+                seconds = self.times[step + 1] - self.times[step]
+                velocities[t, ids] = (moved - x) * (self.grid.voxel / seconds)
+        return Particles(positions=positions, active=active, velocities=velocities)
+
+    def save(self, directory: Path) -> None:
+        """Write liquid.json and four .npz files into `directory`."""
+        settings = self.appearance.decoder.settings
+        header = {
+            "format": FORMAT,
+            "times": [float(t) for t in self.times],
+            "grid": {
+                "origin": [float(x) for x in self.grid.origin],
+                "voxel": self.grid.voxel,
+                "shape": list(self.grid.shape),
+            },
+            "factor": self.factor,
+            "carriers": self.carriers.count,
+            "decoder": dict(vars(settings)),
+        }
+        write_json(directory / "liquid.json", header)
+        carriers = self.carriers
+        positions = np.round(carriers.positions * np.float32(_position_steps(self.grid))).astype(np.uint16)
+        np.savez_compressed(
+            directory / "carriers.npz",
+            starts=carriers.starts,
+            ids=carriers.ids,
+            positions=positions,
+            deformation=carriers.deformation.astype(np.float16),
+            phi=carriers.phi.astype(np.float16),
+        )
+        np.savez_compressed(directory / "velocity.npz", velocities=self.velocities)
+        np.savez_compressed(directory / "phi.npz", phi=self.phi)
+        heads = {f"heads.{name}": value.numpy() for name, value in self.appearance.decoder.state_dict().items()}
+        np.savez_compressed(
+            directory / "appearance.npz",
+            features=self.appearance.features.half().numpy(),
+            log_scales=self.appearance.log_scales.half().numpy(),
+            **heads,
+        )
+
+    @classmethod
+    def load(cls, directory: Path) -> Liquid:
+        """Read what `save` wrote. Raises SplashbenchError naming the file at fault."""
+        path = directory / "liquid.json"
+        header = read_json(path)
+        try:
+            if header["format"] != FORMAT:
+                raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; fit the scene again")
+            box = header["grid"]
+            nx, ny, nz = (int(n) for n in box["shape"])
+            grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
+            times = np.array(header["times"], dtype=np.float64)
+            factor, count = int(header["factor"]), int(header["carriers"])
+            decoder = Decoder(DecoderSettings(**header["decoder"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); fit the scene again") from None
+        ranks = {"starts": 1, "ids": 1, "positions": 2, "deformation": 3, "phi": 1}
+        rows = read_npz(directory / "carriers.npz", ranks)
+        carriers = Carriers(
+            starts=rows["starts"],
+            ids=rows["ids"],
+            positions=rows["positions"].astype(np.float32) / np.float32(_position_steps(grid)),
+            deformation=rows["deformation"].astype(np.float32),
+            phi=rows["phi"].astype(np.float32),
+            count=count,
+        )
+        velocities = read_npz(directory / "velocity.npz", {"velocities": 5})["velocities"]
+        phi = read_npz(directory / "phi.npz", {"phi": 4})["phi"]
+        shapes = {f"heads.{name}": value.ndim for name, value in decoder.state_dict().items()}
+        tables = read_npz(directory / "appearance.npz", {"features": 2, "log_scales": 2, **shapes})
+        try:
+            decoder.load_state_dict({name: torch.from_numpy(tables[f"heads.{name}"]) for name in decoder.state_dict()})
+        except RuntimeError:
+            raise SplashbenchError(
+                f"{directory / 'appearance.npz'} does not fit liquid.json; fit the scene again"
+            ) from None
+        appearance = Appearance(
+            torch.from_numpy(tables["features"].astype(np.float32)),
+            torch.from_numpy(tables["log_scales"].astype(np.float32)),
+            decoder,
+        )
+        return cls(times, grid, carriers, velocities, factor, phi, appearance)

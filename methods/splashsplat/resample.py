@@ -1,0 +1,92 @@
+"""Restoring coverage from each observation (paper, "Resampling", and supplement, "Carriers").
+
+The shell -depth <= phi <= 0 is divided into cells of one transport voxel. A cell with fewer carriers than its target
+gets new ones, uniform within its part of the shell. The target grows with nearness to the silhouettes (|phi| is the
+distance to them) and with the curvature of phi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splashbench.observe.grid import Grid
+from splashbench.observe.kernels import sample
+
+# A cell's corner is this far from its middle, in cells: beyond it, no part of the cell can be in the shell.
+_HALF_DIAGONAL = 0.87
+_TRIES_PER_CARRIER = 6
+
+
+@dataclass(frozen=True)
+class ShellSettings:
+    """depth: of the shell, transport voxels. min_per_cell, max_per_cell: range of a cell's target population."""
+
+    depth: float = 1.5
+    min_per_cell: int = 2
+    max_per_cell: int = 2
+    curvature_weight: float = 0.1
+
+
+def cell_of(positions: np.ndarray, grid: Grid) -> np.ndarray:
+    """Flat cell number of positions [N, 3] (grid coordinates): int64 [N]."""
+    cell = np.clip(np.floor(positions).astype(np.int64), 0, np.array(grid.shape) - 1)
+    return np.ravel_multi_index(tuple(cell.T), grid.shape)
+
+
+def within_capacity(cells: np.ndarray, ids: np.ndarray, capacity: int) -> np.ndarray:
+    """bool [N]: whether a carrier is among the `capacity` oldest (smallest id) of its cell."""
+    order = np.lexsort((ids, cells))
+    ordered = cells[order]
+    first = np.ones(len(cells), dtype=bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    group_start = np.maximum.accumulate(np.where(first, np.arange(len(cells)), 0))
+    kept = np.empty(len(cells), dtype=bool)
+    kept[order] = np.arange(len(cells)) - group_start < capacity
+    return kept
+
+
+def target_population(phi: np.ndarray, centres: np.ndarray, ratio: float, shell: ShellSettings) -> np.ndarray:
+    """Wanted number of carriers of the cells with these `centres` [M, 3] (transport-grid coordinates): int [M]."""
+    points = centres * np.float32(ratio)
+    middle = sample(phi, points)
+    laplacian = -6 * middle
+    for axis in range(3):
+        step = np.zeros(3, dtype=np.float32)
+        step[axis] = ratio
+        laplacian += sample(phi, points + step) + sample(phi, points - step)
+    importance = 0.5 * np.exp(-np.abs(middle)) + shell.curvature_weight * np.abs(laplacian)
+    span = shell.max_per_cell - shell.min_per_cell
+    return np.floor(shell.min_per_cell + np.minimum(importance, 1) * span + 0.5).astype(np.int64)
+
+
+def newborns(
+    phi: np.ndarray,
+    grid: Grid,
+    ratio: float,
+    positions: np.ndarray,
+    shell: ShellSettings,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Positions of new carriers, float32 [M, 3] in transport-grid coordinates, given the present `positions` [N, 3].
+
+    phi: hull-grid field in transport voxels; ratio: hull voxels per transport voxel.
+    """
+    inner = tuple(n - 1 for n in grid.shape)
+    corners = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in inner), indexing="ij"), -1)
+    centres = corners.reshape(-1, 3) + np.float32(0.5)
+    middle = sample(phi, centres * np.float32(ratio))
+    centres = centres[(middle > -shell.depth - _HALF_DIAGONAL) & (middle < _HALF_DIAGONAL)]
+    if len(centres) == 0:
+        return np.zeros((0, 3), dtype=np.float32)
+    population = np.bincount(cell_of(positions, grid), minlength=int(np.prod(grid.shape)))
+    missing = target_population(phi, centres, ratio, shell) - population[cell_of(centres, grid)]
+    centres, missing = centres[missing > 0], missing[missing > 0]
+    # All cells draw the same number of candidates at once; each keeps the first that fall into the shell.
+    tries = _TRIES_PER_CARRIER * shell.max_per_cell
+    candidates = centres[:, None] + rng.random((len(centres), tries, 3), dtype=np.float32) - np.float32(0.5)
+    depth = sample(phi, candidates.reshape(-1, 3) * np.float32(ratio)).reshape(len(centres), tries)
+    valid = (depth <= 0) & (depth >= -shell.depth)
+    chosen = valid & (np.cumsum(valid, axis=1) <= missing[:, None])
+    return np.ascontiguousarray(candidates[chosen])

@@ -1,0 +1,23 @@
+"""What the training masks say about the liquid: visual hull and signed distance (paper, "Observation fields").
+
+Needs no torch. The kernels are compiled at first use (a few seconds) and cached.
+"""
+
+from splashbench.observe.grid import Bounds, Grid
+from splashbench.observe.hull import sequence_bounds
+from splashbench.observe.signed_distance import (
+    SignedDistanceFields,
+    signed_distance_fields,
+    signed_distance_frames,
+)
+from splashbench.observe.silhouettes import Silhouettes
+
+__all__ = [
+    "Bounds",
+    "Grid",
+    "SignedDistanceFields",
+    "Silhouettes",
+    "sequence_bounds",
+    "signed_distance_fields",
+    "signed_distance_frames",
+]

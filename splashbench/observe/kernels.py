@@ -1,0 +1,147 @@
+"""Compiled loops over grids: trilinear interpolation, and the distance to one view's silhouette cone.
+
+The loops run on several threads (parallel.py); each takes the part [start, stop) of its outermost range.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from splashbench.observe.parallel import over_range
+
+_SMALL_LOOP = 4096
+
+
+@numba.njit(cache=True, error_model="numpy")
+def trilinear(field: np.ndarray, x: float, y: float, z: float) -> float:
+    """Value of `field` [nx, ny, nz] at node coordinates (x, y, z); clamped to the grid outside it."""
+    nx, ny, nz = field.shape
+    x = min(max(x, 0.0), nx - 1.0)
+    y = min(max(y, 0.0), ny - 1.0)
+    z = min(max(z, 0.0), nz - 1.0)
+    i = min(int(x), nx - 2)
+    j = min(int(y), ny - 2)
+    k = min(int(z), nz - 2)
+    a = x - i
+    b = y - j
+    c = z - k
+    low = (field[i, j, k] * (1 - c) + field[i, j, k + 1] * c) * (1 - b) + (
+        field[i, j + 1, k] * (1 - c) + field[i, j + 1, k + 1] * c
+    ) * b
+    high = (field[i + 1, j, k] * (1 - c) + field[i + 1, j, k + 1] * c) * (1 - b) + (
+        field[i + 1, j + 1, k] * (1 - c) + field[i + 1, j + 1, k + 1] * c
+    ) * b
+    return low * (1 - a) + high * a
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sample(field: np.ndarray, points: np.ndarray, values: np.ndarray, start: int, stop: int) -> None:
+    for n in range(start, stop):
+        values[n] = trilinear(field, points[n, 0], points[n, 1], points[n, 2])
+
+
+def sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """`field` [nx, ny, nz] at node coordinates `points` [N, 3]: float32 [N]. Outside the grid: its nearest point's."""
+    values = np.empty(len(points), np.float32)
+    over_range(
+        _sample,
+        len(points),
+        np.ascontiguousarray(field),
+        np.ascontiguousarray(points, np.float32),
+        values,
+        smallest=_SMALL_LOOP,
+    )
+    return values
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _resample(field: np.ndarray, ratio: float, out: np.ndarray, start: int, stop: int) -> None:
+    for i in range(start, stop):
+        for j in range(out.shape[1]):
+            for k in range(out.shape[2]):
+                out[i, j, k] = trilinear(field, i * ratio, j * ratio, k * ratio)
+
+
+def resample(field: np.ndarray, shape: tuple[int, int, int], ratio: float) -> np.ndarray:
+    """`field` on another grid of the same origin whose voxel is `ratio` voxels of `field`: float32 `shape`."""
+    out = np.empty(shape, np.float32)
+    over_range(_resample, shape[0], np.ascontiguousarray(field), float(ratio), out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _carve_view(
+    phi: np.ndarray,
+    origin: np.ndarray,
+    voxel: float,
+    projection: np.ndarray,
+    focal: float,
+    silhouette: np.ndarray,
+    corner: np.ndarray,
+    limit: float,
+    start: int,
+    stop: int,
+) -> None:
+    _, ny, nz = phi.shape
+    height, width = silhouette.shape
+    for i in range(start, stop):
+        x = origin[0] + i * voxel
+        for j in range(ny):
+            y = origin[1] + j * voxel
+            for k in range(nz):
+                if phi[i, j, k] >= limit:
+                    continue
+                z = origin[2] + k * voxel
+                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+                if depth <= 0.0:
+                    phi[i, j, k] = limit
+                    continue
+                u = projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]
+                v = projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]
+                # Pixel (row, column) is centred at (column + 0.5, row + 0.5).
+                u = u / depth - 0.5 - corner[0]
+                v = v / depth - 0.5 - corner[1]
+                inside_u = min(max(u, 0.0), width - 1.0)
+                inside_v = min(max(v, 0.0), height - 1.0)
+                column = min(int(inside_u), width - 2)
+                row = min(int(inside_v), height - 2)
+                a = inside_u - column
+                b = inside_v - row
+                pixels = (silhouette[row, column] * (1 - a) + silhouette[row, column + 1] * a) * (1 - b) + (
+                    silhouette[row + 1, column] * (1 - a) + silhouette[row + 1, column + 1] * a
+                ) * b
+                pixels += np.sqrt((u - inside_u) ** 2 + (v - inside_v) ** 2)
+                distance = min(max(pixels * depth / (focal * voxel), -limit), limit)
+                phi[i, j, k] = max(phi[i, j, k], distance)
+
+
+def carve_view(
+    phi: np.ndarray,
+    origin: np.ndarray,
+    voxel: float,
+    projection: np.ndarray,
+    focal: float,
+    silhouette: np.ndarray,
+    corner: np.ndarray,
+    limit: float,
+) -> None:
+    """phi = max(phi, distance to one view's silhouette cone), in place, in voxels, clipped to +-`limit`.
+
+    phi: float32 [nx, ny, nz]. projection: [3, 4], scene to pixels. silhouette: float32 [h, w], signed distance in
+    pixels to the mask's outline, negative inside, of the image window whose top-left pixel is `corner` (x, y). One
+    pixel at depth z spans z / focal scene units. Nodes already `limit` away are skipped; points behind the camera are
+    outside.
+    """
+    over_range(
+        _carve_view,
+        phi.shape[0],
+        phi,
+        np.ascontiguousarray(origin, np.float64),
+        float(voxel),
+        np.ascontiguousarray(projection, np.float64),
+        float(focal),
+        np.ascontiguousarray(silhouette, np.float32),
+        np.ascontiguousarray(corner, np.float64),
+        float(limit),
+    )
