@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-
 PROTOCOL: Literal["v1"] = "v1"
 _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 

@@ -23,6 +23,8 @@ from splashbench.synth.lens import distort, undistort
 from splashbench.synth.truth import Truth
 
 Array = NDArray[np.float64]
+# Radians, a twentieth of a pixel: cameras that agree to this count alike.
+_SEEN_AS_EXACT = 7e-5
 
 
 class _FromReport(BaseModel):
@@ -195,22 +197,38 @@ def _liquid_points(truth: Truth, instants: int = 5, most: int = 2000) -> Array:
     return points[:: max(1, len(points) // most)]
 
 
-def triangulate(truth: Truth, report: _Report, points: Array) -> Array:
-    """Where the estimated cameras see world points [N, 3], in the report's frame: nearest to all their rays."""
-    across, along = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    for name, camera in truth.file.cameras.items():
-        w2c, K = np.array(camera.w2c), np.array(camera.K)
-        local = points @ w2c[:3, :3].T + w2c[:3, 3]
-        raw = distort(local[:, :2] / local[:, 2:], np.array(camera.distortion)) @ K[:2, :2].T + K[:2, 2]
-        lens, pose = report.intrinsics[name], np.array(report.poses[name].w2c)
-        K = np.array(lens.K)
-        seen = undistort((raw - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, np.array(lens.distortion))
-        rays = np.concatenate([seen, np.ones((len(seen), 1))], axis=1) @ pose[:3, :3]
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        off_ray = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        across += off_ray
-        along += off_ray @ _centres([pose])[0]
-    return np.asarray(np.linalg.solve(across, along[..., None])[..., 0])
+def triangulate(truth: Truth, report: _Report, points: Array, rounds: int = 10) -> Array:
+    """Where the estimated cameras see world points [N, 3], in the report's frame: nearest to all their rays.
+
+    A camera far off the others counts for less (each round weighs it by the inverse square of its rays' miss), so that
+    one wrong camera is found wrong and does not turn the rest.
+    """
+    names = sorted(truth.file.cameras)
+    centres = _centres([report.poses[name].w2c for name in names])
+    off_ray = np.stack([_off_ray(truth, report, name, points) for name in names])
+    weights = np.ones(len(names))
+    for _ in range(rounds):
+        across = np.einsum("c,cnij->nij", weights, off_ray)
+        along = np.einsum("c,cnij,cj->ni", weights, off_ray, centres)
+        found = np.linalg.solve(across, along[..., None])[..., 0]
+        reach = found - centres[:, None]
+        miss = np.linalg.norm(np.einsum("cnij,cnj->cni", off_ray, reach), axis=2) / np.linalg.norm(reach, axis=2)
+        weights = 1.0 / (np.mean(miss**2, axis=1) + _SEEN_AS_EXACT**2)
+        weights /= weights.sum()
+    return np.asarray(found)
+
+
+def _off_ray(truth: Truth, report: _Report, name: str, points: Array) -> Array:
+    """Projectors [N, 3, 3] onto the plane across the ray along which the estimated camera sees each world point."""
+    camera, lens, pose = truth.file.cameras[name], report.intrinsics[name], np.array(report.poses[name].w2c)
+    w2c, K = np.array(camera.w2c), np.array(camera.K)
+    local = points @ w2c[:3, :3].T + w2c[:3, 3]
+    raw = distort(local[:, :2] / local[:, 2:], np.array(camera.distortion)) @ K[:2, :2].T + K[:2, 2]
+    K = np.array(lens.K)
+    seen = undistort((raw - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, np.array(lens.distortion))
+    rays = np.concatenate([seen, np.ones((len(seen), 1))], axis=1) @ pose[:3, :3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(np.eye(3) - rays[:, :, None] * rays[:, None, :])
 
 
 def _pose_errors(truth: Truth, report: _Report, similarity: Similarity, name: str) -> dict[str, float]:
