@@ -41,9 +41,9 @@ def random_pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sample_rays(lens: Lens) -> np.ndarray:
-    """Rays [4 * H * W, 3] of 2 x 2 samples per pixel."""
-    rows, columns = np.mgrid[0 : 2 * lens.height, 0 : 2 * lens.width]
-    pixels = np.stack([(columns + 0.5) / 2, (rows + 0.5) / 2], axis=-1).reshape(-1, 2)
+    """Rays [9 * H * W, 3] of 3 x 3 samples per pixel."""
+    rows, columns = np.mgrid[0 : 3 * lens.height, 0 : 3 * lens.width]
+    pixels = np.stack([(columns + 0.5) / 3, (rows + 0.5) / 3], axis=-1).reshape(-1, 2)
     return np.column_stack([lens.normalise(pixels), np.ones(len(pixels))])
 
 
@@ -53,9 +53,9 @@ def photograph(board: np.ndarray, rays: np.ndarray, rotation: np.ndarray, transl
     distance = (normal @ translation) / (rays @ normal)
     on_board = (rays * distance[:, None] - translation) @ rotation
     texels = on_board[:, :2] * TEXELS_PER_METRE + MARGIN_TEXELS - 0.5
-    maps = texels.astype(np.float32).reshape(2 * HEIGHT, 2 * WIDTH, 2)
+    maps = texels.astype(np.float32).reshape(3 * HEIGHT, 3 * WIDTH, 2)
     sampled = cv2.remap(board, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
-    return sampled.reshape(HEIGHT, 2, WIDTH, 2).mean(axis=(1, 3))
+    return sampled.reshape(HEIGHT, 3, WIDTH, 3).mean(axis=(1, 3))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def clip(detector: BoardDetector) -> list[np.ndarray]:
     rng = np.random.default_rng(7)
     board, rays = printed_board(detector), sample_rays(LENS)
     frames = []
-    for _ in range(24):
+    for _ in range(28):
         grey = 0.8 * photograph(board, rays, *random_pose(rng)) + 20 + rng.normal(0, 2.5, (HEIGHT, WIDTH))
         frames.append(np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2))
     return frames

@@ -1,6 +1,7 @@
-"""The whole of `splashbench prepare`: unusable recordings each give one line and no scene; a made-up session gives a scene.
+"""All of `splashbench prepare`: unusable recordings each give one line and no scene, a made-up session gives a scene.
 
-The clips here are tiny and show a moving square over a shared noise: enough for the clocks and the motion, not for a lens.
+The clips here are tiny and show a moving square over a shared noise: enough for the clocks and the motion, not for a
+lens.
 """
 
 from __future__ import annotations

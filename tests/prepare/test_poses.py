@@ -169,13 +169,6 @@ def test_every_camera_is_posed_in_metres_with_gravity_down(capture: Capture, sol
     assert np.median(np.abs(points[np.abs(points[:, 1]) < 0.02, 1])) < 0.003
 
 
-def test_the_lenses_that_were_calibrated_are_not_touched(capture: Capture, solved: Poses) -> None:
-    # Poses fit the given lens: its own projection of the points it triangulated agrees with the error reported.
-    w2c = solved.w2c["1"]
-    in_front = solved.points @ w2c[2, :3] + w2c[2, 3] > 0
-    assert in_front.mean() > 0.9
-
-
 def test_the_same_images_give_the_same_bits(capture: Capture, solved: Poses, tmp_path: Path) -> None:
     again = estimate_poses(capture.static, capture.lenses, capture.sweep, tmp_path)
     for camera in capture.w2c:

@@ -1,0 +1,1 @@
+"""Session to Scene: a raw recording becomes calibrated, synchronised, masked frames; a file per step."""

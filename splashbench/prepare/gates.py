@@ -1,0 +1,169 @@
+"""Pass marks of a preparation: figures that tell a sound scene from one that merely was computed.
+
+An essential gate that fails stops `prepare`; any other is a warning, kept in the report. Limits follow from what the
+figure does to a scene, or from what the paper's own captures reach, and stand beside the value in the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from splashbench.errors import SplashbenchError
+from splashbench.prepare.intrinsics import Calibration
+from splashbench.prepare.masks import MaskHealth
+from splashbench.prepare.metric import MetricFrame
+from splashbench.prepare.poses import Poses
+from splashbench.prepare.sampling import Sampling
+from splashbench.prepare.sync import ClockFit, SequenceSync
+
+# Half a frame at 60 fps: the paper's mark for a well synchronised sequence (Sec. S1.1).
+HALF_FRAME_S = 0.5 / 60
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One pass mark. `value` is None where the figure could not be had, which fails."""
+
+    name: str
+    value: float | None
+    limit: float
+    side: Literal["at most", "at least"]
+    detail: str
+    essential: bool = False
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is on the right side of the limit."""
+        if self.value is None or not np.isfinite(self.value):
+            return False
+        return self.value <= self.limit if self.side == "at most" else self.value >= self.limit
+
+    def as_json(self) -> dict[str, Any]:
+        """The gate as it stands in prepare_report.json."""
+        value = self.value if self.value is not None and np.isfinite(self.value) else None
+        return {
+            "name": self.name,
+            "value": value,
+            "limit": self.limit,
+            "side": self.side,
+            "passed": self.passed,
+            "essential": self.essential,
+            "detail": self.detail,
+        }
+
+
+def pixel_limit(width: int) -> float:
+    """Reprojection error to accept, in pixels of an image `width` wide: 1 px per 1000, never below half a pixel.
+
+    The paper's 0.9 px at 3840 is 0.23 px per 1000; features of small images are not found to better than a fraction
+    of a pixel whatever the camera.
+    """
+    return max(0.5, width / 1000)
+
+
+def intrinsics_gates(calibrations: Mapping[str, Calibration]) -> list[Gate]:
+    """Focal length's uncertainty, coverage and error on unseen views: the worst camera counts."""
+    sigma = {camera: c.focal_sigma_px / c.lens.focal for camera, c in calibrations.items()}
+    held_out = {camera: c.held_out_rms_px / pixel_limit(c.lens.width) for camera, c in calibrations.items()}
+    covered = {camera: c.coverage for camera, c in calibrations.items()}
+    worst_sigma, worst_error = max(sigma, key=sigma.__getitem__), max(held_out, key=held_out.__getitem__)
+    least = min(covered, key=covered.__getitem__)
+    limit = pixel_limit(calibrations[worst_error].lens.width)
+    return [
+        Gate("focal_sigma", sigma[worst_sigma], 0.005, "at most", f"share of the focal length, camera {worst_sigma}"),
+        Gate("board_coverage", covered[least], 0.6, "at least", f"share of the image's 8 x 6 cells, camera {least}"),
+        Gate(
+            "held_out_reprojection",
+            calibrations[worst_error].held_out_rms_px,
+            limit,
+            "at most",
+            f"px RMS of {calibrations[worst_error].lens.width} px wide frames the fit never saw, camera {worst_error}",
+        ),
+    ]
+
+
+def sync_gates(clocks: Mapping[str, ClockFit], sequence: SequenceSync | None) -> list[Gate]:
+    """Every clock found, their scatter, and the paper's residual synchronisation error of the sequence."""
+    found = sum(fit.status == "ok" for fit in clocks.values())
+    scatter = {camera: fit.residual_rms_s for camera, fit in clocks.items()}
+    worst = max(scatter, key=scatter.__getitem__)
+    gates = [
+        Gate("cameras_synchronised", found, len(clocks), "at least", f"of {len(clocks)} cameras", essential=True),
+        Gate(
+            "clock_residual", scatter[worst], 1e-3, "at most", f"s RMS of the windows about the clock, camera {worst}"
+        ),
+    ]
+    if sequence is not None and sequence.rms_s is not None:
+        missing = f"; not measurable: {', '.join(sequence.unmeasured)}" if sequence.unmeasured else ""
+        detail = f"s over the sequence's own sound{missing}"
+        gates.append(Gate("sequence_sync", sequence.rms_s, HALF_FRAME_S, "at most", detail))
+    return gates
+
+
+def pose_gates(poses: Poses, cameras: Iterable[str], width: int) -> list[Gate]:
+    """All fixed cameras posed, the reprojection error, and how much of the sweep helped."""
+    names = list(cameras)
+    posed = sum(camera in poses.w2c for camera in names)
+    gates = [
+        Gate("cameras_posed", posed, len(names), "at least", f"of {len(names)} cameras", essential=True),
+        Gate(
+            "mean_reprojection",
+            poses.mean_error_px,
+            pixel_limit(width),
+            "at most",
+            f"px, mean over {poses.n_observations} observations in frames {width} px wide",
+        ),
+        Gate("track_length", poses.mean_track_length, 3.0, "at least", "images per point, mean"),
+    ]
+    if poses.n_sweep:
+        share = len(poses.sweep_w2c) / poses.n_sweep
+        gates.append(Gate("sweep_registered", share, 0.5, "at least", f"share of {poses.n_sweep} frames"))
+    return gates
+
+
+def metric_gates(frame: MetricFrame) -> list[Gate]:
+    """How well the triangulated board has the shape of the printed one."""
+    relative = frame.rms_m / frame.board_diagonal_m
+    detail = f"RMS over the board's diagonal, {frame.n_corners} corners in {frame.n_views} images"
+    return [
+        Gate("board_residual", relative, 0.005, "at most", detail),
+        Gate("board_is_a_board", relative, 0.05, "at most", "as above; beyond this the scale is meaningless", True),
+    ]
+
+
+def sampling_gates(sampling: Sampling) -> list[Gate]:
+    """Frames that miss their instant by more than half a source frame."""
+    missed = int(sum(flags.sum() for flags in sampling.flagged.values()))
+    return [Gate("frames_off_their_instant", missed, 0, "at most", "images more than half a source frame off")]
+
+
+def mask_gates(health: Mapping[str, MaskHealth], n_frames: int) -> list[Gate]:
+    """Masks that cannot be right, and masks without liquid."""
+    failed = sum(len(h.failed) for h in health.values())
+    empty = max(len(h.empty) for h in health.values()) / n_frames
+    most = max(health, key=lambda camera: len(health[camera].empty))
+    return [
+        Gate("masks_failed", failed, 0, "at most", "flooded or flickering masks over all cameras"),
+        Gate("masks_empty", empty, 0.2, "at most", f"share of empty masks, camera {most}"),
+    ]
+
+
+def source_gate(share: Mapping[str, float]) -> Gate:
+    """Whether pixels of the written images lie outside the raw frame (pincushion distortion)."""
+    least = min(share, key=share.__getitem__)
+    return Gate("pixels_with_source", share[least], 0.999, "at least", f"share of the written image, camera {least}")
+
+
+def require(gates: Iterable[Gate], source: str) -> None:
+    """Raise SplashbenchError for the first essential gate that failed."""
+    for gate in gates:
+        if gate.essential and not gate.passed:
+            value = "unknown" if gate.value is None else f"{gate.value:.4g}"
+            raise SplashbenchError(
+                f"{source}: {gate.name} is {value}, {gate.side} {gate.limit:.4g} is needed ({gate.detail});"
+                " film it again"
+            )

@@ -1,0 +1,126 @@
+"""Masks of a whole session: the provider asked for, undistortion, and the boxes that the crop follows from.
+
+Masks are made before the crop is known, and the crop before the scene is written, so they wait on disk in between: at
+4K the masks of one scene are gigabytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import read_gray, write_png
+from splashbench.prepare.background import BackgroundMasks
+from splashbench.prepare.crop import Box, bounding_box, crop_window
+from splashbench.prepare.masks import FolderMasks, Mask, MaskProvider, mask_health, read_raw_mask
+from splashbench.prepare.preparation import MaskRecord
+from splashbench.prepare.sampling import Sampling
+from splashbench.prepare.session import Session
+from splashbench.prepare.sync import ClockFit
+from splashbench.prepare.undistort import Undistorter
+from splashbench.prepare.video import Recording
+from splashbench.progress import track
+
+QUIET_FRAMES = 31  # before the motion, whose median is the background
+QUIET_SECONDS = 3.0  # taken from at most this long before the motion, as the light may change
+QUIET_MARGIN_S = 0.1
+
+
+def choose_provider(
+    folder: Path | None, pour: Mapping[str, Recording], clocks: Mapping[str, ClockFit], motion_start: float
+) -> MaskProvider:
+    """Masks from a folder where one is given, else by subtraction of what was there before the motion."""
+    if folder is not None:
+        if not folder.is_dir():
+            raise SplashbenchError(f"{folder} is not a folder of masks; give one, or --masks background")
+        infos = {camera: recording.info for camera, recording in pour.items()}
+        return FolderMasks(folder, {camera: (info.width, info.height) for camera, info in infos.items()})
+    quiet = {
+        camera: quiet_frames(recording, float(clocks[camera].to_local(motion_start)))
+        for camera, recording in pour.items()
+    }
+    sources = {camera: str(recording.paths[0]) for camera, recording in pour.items()}
+    return BackgroundMasks(lambda camera, indices: pour[camera].frames(indices), quiet, sources)
+
+
+def quiet_frames(recording: Recording, motion_start: float) -> list[int]:
+    """Source frames shortly before the motion begins (local seconds), spread evenly."""
+    until = motion_start - QUIET_MARGIN_S
+    local = recording.frame_times
+    before = np.flatnonzero((local < until) & (local >= until - QUIET_SECONDS))
+    return before[np.linspace(0, len(before) - 1, min(len(before), QUIET_FRAMES)).astype(int)].tolist()
+
+
+class MaskStore:
+    """Undistorted, uncropped masks of every camera and timestep, on disk under `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.boxes: dict[str, Box] = {}  # camera -> union of its masks' boxes
+
+    def fill(
+        self,
+        provider: MaskProvider,
+        sampled: Sampling,
+        undistorters: Mapping[str, Undistorter],
+        sources: Mapping[str, Recording],
+    ) -> MaskRecord:
+        """Make all masks. Raises SplashbenchError for a camera whose masks are all empty."""
+        areas: dict[str, list[int]] = {}
+        for camera, undistorter in track(undistorters.items(), f"masks ({provider.name})", total=len(undistorters)):
+            areas[camera] = []
+            union: Box | None = None
+            for t, (_, raw) in enumerate(provider.masks(camera, sampled.indices[camera].tolist())):
+                mask = undistorter.mask(raw)
+                areas[camera].append(int(mask.sum()))
+                box = bounding_box(mask)
+                union = box.union(union) if box else union
+                write_png(self._path(camera, t), mask.astype(np.uint8) * 255)
+            if union is None:
+                raise SplashbenchError(
+                    f"{sources[camera].paths[0]}: all {len(areas[camera])} masks of camera {camera} are empty"
+                    f" ({provider.name}); give masks in a folder with --masks, or set motion_interval in session.toml"
+                )
+            self.boxes[camera] = union
+        health = {camera: mask_health(areas[camera], undistorters[camera].n_pixels) for camera in areas}
+        return MaskRecord(provider.name, areas, health)
+
+    def read(self, camera: str, t: int) -> Mask:
+        """One mask [H, W]."""
+        return np.asarray(read_gray(self._path(camera, t)) > 0)
+
+    def windows(self, undistorters: Mapping[str, Undistorter], crop: bool) -> dict[str, Box]:
+        """Camera -> the window to be written: the paper's crop, or the whole frame."""
+        windows = {}
+        for camera, undistorter in undistorters.items():
+            width, height = undistorter.lens.width, undistorter.lens.height
+            whole = Box(0, 0, width, height)
+            windows[camera] = crop_window(self.boxes[camera], width, height) if crop else whole
+        return windows
+
+    def _path(self, camera: str, t: int) -> Path:
+        return self._folder / camera / f"{t:06d}.png"
+
+
+def container_folder(session: Session) -> Path | None:
+    """Where session.toml says the container masks are (`container_folder` under [masks]); None where it does not."""
+    relative = getattr(session.masks, "container_folder", None)
+    return None if relative is None else session.directory / relative
+
+
+def container_masks(
+    folder: Path | None, undistorters: Mapping[str, Undistorter], windows: Mapping[str, Box]
+) -> dict[str, Mask] | None:
+    """Container masks as the scene holds them, from FOLDER/<camera>.png in raw geometry; None where there are none."""
+    if folder is None:
+        return None
+    found = {}
+    for camera, undistorter in undistorters.items():
+        path = folder / f"{camera}.png"
+        if path.is_file():
+            raw = read_raw_mask(path, undistorter.lens.width, undistorter.lens.height)
+            found[camera] = windows[camera].cut(undistorter.mask(raw))
+    return found or None

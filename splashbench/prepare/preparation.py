@@ -1,0 +1,142 @@
+"""Everything that preparing one session found out, as prepare_report.json tells it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.prepare.crop import Box
+from splashbench.prepare.gates import Gate
+from splashbench.prepare.intrinsics import Calibration
+from splashbench.prepare.masks import MaskHealth
+from splashbench.prepare.metric import MetricFrame
+from splashbench.prepare.motion import MotionInterval
+from splashbench.prepare.poses import Poses
+from splashbench.prepare.sampling import Sampling
+from splashbench.prepare.session import Session
+from splashbench.prepare.sync import ClockFit, SequenceSync
+from splashbench.version import __version__
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class MaskRecord:
+    """The masks as written: areas in pixels of the undistorted, uncropped frames, [T] per camera."""
+
+    provider: str
+    areas: dict[str, list[int]]
+    health: dict[str, MaskHealth]
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """The outcome of every stage. `poses` is in the scene frame; `stages`: stage -> seconds."""
+
+    session: Session
+    calibrations: dict[str, Calibration]
+    clocks: dict[str, ClockFit]
+    sequence: SequenceSync
+    poses: Poses
+    metric: MetricFrame
+    motion: MotionInterval
+    sampling: Sampling
+    masks: MaskRecord
+    windows: dict[str, Box]
+    cropped: bool
+    gates: list[Gate]
+    stages: dict[str, float]
+    thumbnails: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict, repr=False)
+
+    @property
+    def warnings(self) -> list[Gate]:
+        """Gates that did not pass."""
+        return [gate for gate in self.gates if not gate.passed]
+
+    def as_json(self) -> dict[str, Any]:
+        """The content of prepare_report.json. Times in seconds on the reference camera's clock, lengths in metres."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "splashbench": __version__,
+            "session": self.session.name,
+            "reference": self.session.reference,
+            "sync": {camera: self._sync(camera) for camera in self.clocks},
+            "intrinsics": {camera: _intrinsics(c) for camera, c in self.calibrations.items()},
+            "poses": {camera: {"w2c": matrix.tolist()} for camera, matrix in self.poses.w2c.items()},
+            "structure_from_motion": {
+                "mean_reprojection_px": self.poses.mean_error_px,
+                "rms_reprojection_px": self.poses.rms_error_px,
+                "definition": "over all observations of all registered images, pixels of the raw frames",
+                "image_width": next(iter(self.calibrations.values())).lens.width,
+                "points": len(self.poses.points),
+                "observations": self.poses.n_observations,
+                "sweep_frames": self.poses.n_sweep,
+                "sweep_frames_registered": len(self.poses.sweep_w2c),
+                "sweep_K": self.poses.sweep_lens.K.tolist(),
+            },
+            "metric": {
+                "board_rms_m": self.metric.rms_m,
+                "corners": self.metric.n_corners,
+                "images": self.metric.n_views,
+                "frame": "metres, origin at the board's centre, +y up, +x along the print",
+            },
+            "motion": {
+                "start_s": self.motion.start,
+                "end_s": self.motion.end,
+                "reasons": list(self.motion.reasons),
+            },
+            "sampling": {
+                "times": self.sampling.times.tolist(),
+                "nominal": self.sampling.nominal.tolist(),
+                "camera_times": {camera: times.tolist() for camera, times in self.sampling.camera_times.items()},
+                "source_frames": {camera: found.tolist() for camera, found in self.sampling.indices.items()},
+                "largest_spread_s": float(self.sampling.spread_s.max()),
+            },
+            "masks": {
+                "provider": self.masks.provider,
+                "areas_px": self.masks.areas,
+                "empty": {camera: health.empty for camera, health in self.masks.health.items()},
+                "failed": {camera: health.failed for camera, health in self.masks.health.items()},
+            },
+            "crop": {
+                "applied": self.cropped,
+                "windows": {camera: [box.x0, box.y0, box.x1, box.y1] for camera, box in self.windows.items()},
+            },
+            "gates": [gate.as_json() for gate in self.gates],
+            "stages": self.stages,
+        }
+
+    def _sync(self, camera: str) -> dict[str, Any]:
+        fit = self.clocks[camera]
+        return {
+            "start_s": fit.start_s,
+            "clock_rate": fit.clock_rate,
+            # The reference agrees with itself without bound, which JSON cannot say.
+            "confidence": fit.confidence if np.isfinite(fit.confidence) else None,
+            "residual_rms_s": fit.residual_rms_s,
+            "windows": fit.n_windows,
+            "status": fit.status,
+            "sequence_offset_s": self.sequence.offsets_s.get(camera),
+        }
+
+
+def _intrinsics(calibration: Calibration) -> dict[str, Any]:
+    lens = calibration.lens
+    return {
+        "K": lens.K.tolist(),
+        "distortion": lens.distortion.tolist(),
+        "width": lens.width,
+        "height": lens.height,
+        "rms_px": calibration.rms_px,
+        "held_out_rms_px": calibration.held_out_rms_px,
+        "focal_sigma_px": calibration.focal_sigma_px,
+        "coverage": calibration.coverage,
+        "frames_searched": calibration.n_searched,
+        "boards_detected": calibration.n_detected,
+        "false_detections": calibration.n_false,
+        "outlier_views": calibration.n_outliers,
+        "views_used": calibration.n_views,
+    }
