@@ -105,12 +105,6 @@ class MaskStore:
         return self._folder / camera / f"{t:06d}.png"
 
 
-def container_folder(session: Session) -> Path | None:
-    """Where session.toml says the container masks are (`container_folder` under [masks]); None where it does not."""
-    relative = getattr(session.masks, "container_folder", None)
-    return None if relative is None else session.directory / relative
-
-
 def container_masks(
     folder: Path | None, undistorters: Mapping[str, Undistorter], windows: Mapping[str, Box]
 ) -> dict[str, Mask] | None:

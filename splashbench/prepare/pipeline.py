@@ -138,7 +138,7 @@ class _Run:
                 frames=_frames(pour, sampled, undistorters, store, windows, thumbnails),
                 meta=self._meta(sampled, windows, record.provider),
                 initial_points=metric.initial_points(placed),
-                container_masks=masking.container_masks(masking.container_folder(session), undistorters, windows),
+                container_masks=masking.container_masks(session.container_folder, undistorters, windows),
                 image_format=self.options.image_format,
             )
         return Preparation(

@@ -61,10 +61,14 @@ class Sweep(_Strict):
 
 
 class Masks(_Strict):
-    """Where liquid masks come from: `background` subtraction, or a `folder` of <camera>/<source frame:06d>.png."""
+    """Where liquid masks come from: `background` subtraction, or a `folder` of <camera>/<source frame:06d>.png.
+
+    container_folder: folder of <camera>.png, masks of the container; optional.
+    """
 
     provider: Literal["background", "folder"] = "background"
     folder: str | None = None
+    container_folder: str | None = None
 
     @model_validator(mode="after")
     def _folder_goes_with_its_provider(self) -> Masks:
@@ -143,6 +147,8 @@ class Session(_Strict):
             session._check(chapter, "the sweep")
         if session.masks.folder is not None:
             session._check(session.masks.folder, "the mask folder", folder=True)
+        if session.masks.container_folder is not None:
+            session._check(session.masks.container_folder, "the folder of container masks", folder=True)
         return session
 
     def _check(self, relative: str, what: str, folder: bool = False) -> None:
@@ -189,3 +195,8 @@ class Session(_Strict):
     def mask_folder(self) -> Path | None:
         """The folder of ready-made masks, where `masks.provider` says so."""
         return None if self.masks.folder is None else self._directory / self.masks.folder
+
+    @property
+    def container_folder(self) -> Path | None:
+        """The folder of container masks, where `masks.container_folder` names one."""
+        return None if self.masks.container_folder is None else self._directory / self.masks.container_folder

@@ -154,3 +154,15 @@ def test_no_folder_and_no_description(tmp_path: Path) -> None:
         Session.open(tmp_path / "nowhere")
     with pytest.raises(SplashbenchError, match=r"session\.toml does not exist"):
         Session.open(tmp_path)
+
+
+def test_container_masks_come_from_a_folder_within_the_session(tmp_path: Path) -> None:
+    data = description()
+    data["masks"]["container_folder"] = "container"
+    with pytest.raises(SplashbenchError, match=r"the folder of container masks"):
+        Session.open(write(tmp_path, data))
+    (tmp_path / "container").mkdir()
+    assert Session.open(tmp_path).container_folder == tmp_path / "container"
+    data["masks"]["container_folder"] = "../container"
+    with pytest.raises(SplashbenchError, match=r"\.\./container"):
+        Session.open(write(tmp_path, data))
