@@ -18,7 +18,6 @@ from splashbench.prepare.crop import Box, bounding_box, crop_window
 from splashbench.prepare.masks import FolderMasks, Mask, MaskProvider, mask_health, read_raw_mask
 from splashbench.prepare.preparation import MaskRecord
 from splashbench.prepare.sampling import Sampling
-from splashbench.prepare.session import Session
 from splashbench.prepare.sync import ClockFit
 from splashbench.prepare.undistort import Undistorter
 from splashbench.prepare.video import Recording

@@ -42,8 +42,8 @@ def speed_accuracy_chart(sources: Sequence[Source], out: Path, with_paper: bool 
     """Draw speed_accuracy.png and .svg into the folder `out`; returns their paths.
 
     Faint dots are runs, full marks the inter-quartile mean of a method with 95% bootstrap bars, the staircase the
-    Pareto front; a mark's area is the peak memory. A row of panels per machine; with `with_paper`, one more with the
-    paper's figures, hollow.
+    Pareto front; a mark's area is the peak memory. Without LPIPS weights mIoU takes the panel of LPIPS. A row of
+    panels per machine; with `with_paper`, one more with the paper's figures, hollow.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -59,7 +59,7 @@ def speed_accuracy_chart(sources: Sequence[Source], out: Path, with_paper: bool 
         figure = Figure(figsize=(10.5, 0.9 + 3.7 * len(rows)), layout="constrained")
         axes = figure.subplots(len(rows), 2, squeeze=False)
         for row, (left, right) in zip(rows, axes):
-            _panel(left, row, "lpips", looks, largest)
+            _panel(left, row, row.perceptual_name(), looks, largest)
             _panel(right, row, row.quality_name(), looks, largest)
             left.set_title(row.title)
         figure.suptitle("Speed against accuracy, test views", x=0.01, ha="left", fontsize=12, fontweight="bold")
@@ -153,7 +153,7 @@ def _set_limits(axes: Axes, row: Machine, name: str, summaries: dict[str, Summar
 
 
 def _on_scale(method: str, name: str) -> bool:
-    return method != _ORACLE or name == "lpips"
+    return method != _ORACLE or name in ("lpips", "miou")
 
 
 def _draw_controls(axes: Axes, row: Machine, name: str) -> None:
@@ -171,6 +171,7 @@ def _draw_controls(axes: Axes, row: Machine, name: str) -> None:
             va="bottom",
             fontsize=7.5,
             color=_GREY,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
         )
 
 

@@ -58,6 +58,9 @@ class Summary:
     value_interval: tuple[float, float] | None
 
 
+_SHOWN = ("lpips", "miou", "dpsnr_bg", "psnr")
+
+
 @dataclass
 class Machine:
     """One row of panels: everything measured on one machine, or reported for it."""
@@ -73,6 +76,12 @@ class Machine:
         """`dpsnr_bg` where every run has it, else `psnr`: one panel never mixes the two."""
         dots = [dot for entry in self.entries for dot in entry.dots]
         return "dpsnr_bg" if dots and all("dpsnr_bg" in dot.values for dot in dots) else "psnr"
+
+    def perceptual_name(self) -> str:
+        """`lpips` where any run has it; else `miou`, which needs no network weights, rather than an empty panel."""
+        dots = [dot for entry in self.entries for dot in entry.dots]
+        measured = {name for dot in dots for name in dot.values}
+        return "miou" if "miou" in measured and "lpips" not in measured else "lpips"
 
 
 def summarize(pairs: NDArray[np.float64]) -> Summary:
@@ -118,7 +127,7 @@ def _machine(title: str, results: list[Result]) -> Machine:
     controls: dict[str, list[dict[str, float]]] = defaultdict(list)
     names = _labels(results)
     for result in results:
-        values = {name: value for name in ("lpips", "dpsnr_bg", "psnr") if (value := result.value(name)) is not None}
+        values = {name: value for name in _SHOWN if (value := result.value(name)) is not None}
         seconds = result.value("fit_seconds")
         if result.status != "ok":
             machine.failures[f"{result.method}: {result.status}"] += 1

@@ -54,6 +54,15 @@ def test_the_gain_over_background_is_charted_only_when_every_run_has_it(make_res
     assert machine.quality_name() == "psnr"
 
 
+def test_without_lpips_weights_the_panel_shows_miou(make_result: Any) -> None:
+    without = make_result("alpha", 0, psnr=20.0, miou=0.8, fit_seconds=5.0)
+    (machine,) = machines([Source("0.json", without)])
+    assert machine.perceptual_name() == "miou"
+    weighed = make_result("beta", 0, psnr=20.0, miou=0.8, lpips=0.1, fit_seconds=5.0)
+    (machine,) = machines([Source("0.json", without), Source("1.json", weighed)])
+    assert machine.perceptual_name() == "lpips"
+
+
 def test_presets_and_settings_of_a_method_are_told_apart(make_result: Any) -> None:
     results = [
         make_result("alpha", 0, psnr=20.0, fit_seconds=5.0),
