@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("embreex")
 
 from splashbench.cli import synth as command
+from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
 from splashbench.synth.scenes import RECIPES, make_scene
@@ -51,7 +52,15 @@ def test_the_particles_lie_in_every_views_masks(scene: Scene) -> None:
 
 
 def test_the_command_knows_every_recipe() -> None:
-    assert set(RECIPES) == set(command._SCENES)
+    assert {*RECIPES, "balls"} == set(command._SCENES)
+
+
+def test_the_scene_that_needs_no_simulation_is_made_by_the_command(tmp_path: Path) -> None:
+    arguments = ["synth", "scene", "balls", str(tmp_path / "balls"), "--timesteps", "3", "--size", "60x40"]
+    assert main(arguments) == 0
+    scene = Scene.open(tmp_path / "balls")
+    assert scene.n_frames == 3
+    assert (scene.cameras["1"].width, scene.cameras["1"].height) == (60, 40)
 
 
 def test_an_unknown_scene_is_refused(tmp_path: Path) -> None:
