@@ -14,7 +14,7 @@ from splashbench.scene import Camera, Particles, TrainingScene
 
 
 class Settings(MethodConfig):
-    presets: ClassVar = {"best": {}, "quick": {"points": 2000}}  # the first one is the default
+    presets: ClassVar[dict] = {"best": {}, "quick": {"points": 2000}}  # the first one is the default
     points: int = 8000  # per frame
     cells: int = 64  # of the hull's grid, along its longest side
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -144,9 +145,9 @@ def _number(value: float | None) -> float | None:
 
 
 def _versions() -> dict[str, str]:
-    """The software the figures depend on."""
-    return {
-        "splashbench": __version__,
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
-    }
+    """The software the figures depend on; PyTorch only where it is there, since LPIPS alone needs it."""
+    versions = {"splashbench": __version__, "python": platform.python_version()}
+    for name in ("numpy", "scipy", "torch"):
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions

@@ -12,7 +12,7 @@ from splashbench.scene import Camera, Particles, TrainingScene
 
 
 class _Settings(MethodConfig):
-    presets: ClassVar = {"best": {}, "blue": {"blue": 1.0}}
+    presets: ClassVar[dict] = {"best": {}, "blue": {"blue": 1.0}}
     blue: float = 0.25
 
 
