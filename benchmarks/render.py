@@ -17,8 +17,8 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.parallel import thread_count
 from splashbench.render import cpu
-from splashbench.render.workers import thread_count
 from splashbench.scene import Camera
 
 SCENES = {"iii": (5_000, 240, 160), "i": (20_000, 640, 416)}

@@ -12,7 +12,8 @@ from typing import ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from splashbench_methods.scaffold_gs.anchors import look_at
+from splashbench_methods.scaffold_gs.depth import look_at
+from splashbench_methods.scaffold_gs.sweep import for_opencv, plane_homography
 
 from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.files import write_json
@@ -49,7 +50,7 @@ class NearestView(Fitted):
     def render(self, camera: Camera, time: float) -> Render:
         source = self.source(camera)
         t = int(np.abs(self.scene.camera_times[source.name] - time).argmin())
-        warp = _pixel_centres(homography(camera, source, self.center))
+        warp = for_opencv(homography(camera, source, self.center))
         size = (camera.width, camera.height)
         image, mask = (
             cv2.warpPerspective(
@@ -79,13 +80,5 @@ def homography(target: Camera, source: Camera, point: NDArray) -> NDArray[np.flo
 
     Where the point does not lie before the target camera, the plane at infinity is taken.
     """
-    relative = source.w2c @ np.linalg.inv(target.w2c)
     depth = float(target.w2c[2, :3] @ point + target.w2c[2, 3])
-    shift = np.outer(relative[:3, 3], [0.0, 0.0, 1.0]) / depth if depth > 1e-9 else np.zeros((3, 3))
-    return np.asarray(source.K @ (relative[:3, :3] + shift) @ np.linalg.inv(target.K))
-
-
-def _pixel_centres(matrix: NDArray) -> NDArray:
-    """The same map for OpenCV, whose pixel centres lie at whole numbers instead of +0.5."""
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    return np.asarray(np.linalg.inv(half) @ matrix @ half)
+    return plane_homography(target, source, 1 / depth if depth > 1e-9 else 0.0)

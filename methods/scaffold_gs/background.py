@@ -82,12 +82,13 @@ def fit_background(
 
     plates: list[Plate] = []
     for i, name in enumerate(scene.train):
-        progress(0.1 * i / len(scene.train), "liquid-free plates")
+        progress(0.05 * i / len(scene.train), "liquid-free plates")
         plates.append(make_plate(scene, name, settings.longest_side))
     colors = np.concatenate([plate.image[plate.seen] for plate in plates])
     if not len(colors):
         raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view throughout; mend the masks")
     far_color = np.median(colors, axis=0)
+    progress(0.05, "depths of the background")
     seed = seed_anchors(scene.initial_points(), plates, settings.anchors, np.random.default_rng(run.seed))
     with one_torch_thread():
         model = fit_model(seed, plates, settings, far_color, run.seed, lambda f: progress(0.1 + 0.9 * f, "background"))

@@ -12,18 +12,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed
-from splashbench_methods.scaffold_gs.losses import SsimTarget, l1, ssim
 from splashbench_methods.scaffold_gs.model import AnchorModel
 from splashbench_methods.scaffold_gs.plate import Plate
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
 from splashbench.render import rasterize
+from splashbench.render.ssim import SsimTarget, ssim
 
 _SSIM_WEIGHT = 0.2
 _VOLUME_WEIGHT = 0.01
 _DECAY = 0.1
 # An anchor stays if it makes up at least this much of the seen pixels of all training views together.
 _MIN_PIXELS = 0.5
+
+
+def l1(image: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Mean absolute difference of [H, W, 3] images over the pixels where `weight` [H, W] is 1."""
+    return ((image - target).abs() * weight[..., None]).sum() / (3 * weight.sum()).clamp(min=1)
 
 
 def fit_model(

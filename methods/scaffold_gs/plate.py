@@ -47,7 +47,8 @@ def make_plate(scene: TrainingScene, name: str, longest_side: int) -> Plate:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     wet = np.stack([cv2.dilate(scene.mask(name, t).astype(np.uint8), disc) > 0 for t in frames])
     median = masked_median(images, ~wet)
-    return _shrunk(camera, median, np.asarray(~wet.all(axis=0)), longest_side)
+    colors: NDArray[np.float32] = np.asarray(median / 255, dtype=np.float32)
+    return shrunk(Plate(camera, colors, np.asarray(~wet.all(axis=0))), longest_side)
 
 
 def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -63,16 +64,16 @@ def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArra
     return median
 
 
-def _shrunk(camera: Camera, image: NDArray[np.uint8], seen: NDArray[np.bool_], longest_side: int) -> Plate:
-    factor = min(1.0, longest_side / max(camera.width, camera.height))
-    colors: NDArray[np.float32] = np.asarray(image / 255, dtype=np.float32)
+def shrunk(plate: Plate, longest_side: int) -> Plate:
+    """`plate`, smaller so that no side exceeds `longest_side`."""
+    factor = min(1.0, longest_side / max(plate.camera.width, plate.camera.height))
     if factor == 1.0:
-        return Plate(camera, colors, seen)
-    small = camera.scaled(factor)
+        return plate
+    small = plate.camera.scaled(factor)
     size = (small.width, small.height)
     # A shrunk pixel counts where most of it was seen, with the mean of what was.
-    share = cv2.resize(seen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    total = cv2.resize(colors * seen[..., None], size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(plate.seen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(plate.image * plate.seen[..., None], size, interpolation=cv2.INTER_AREA)
     kept = np.asarray(share > 0.9)
     mean: NDArray[np.float32] = np.where(kept[..., None], total / np.maximum(share, 1e-6)[..., None], np.float32(0))
     return Plate(small, mean, kept)

@@ -157,7 +157,7 @@ def fit_appearance(
             queue = rng.permutation(len(targets)).tolist()
         target = targets[queue.pop()]
         active = ids[target.frame]
-        rows = [table.table[active].requires_grad_() for table in tables]
+        rows = [table.table.index_select(0, active).requires_grad_() for table in tables]
         children = appearance.decoder(*rows, states[target.frame], target.eye)
         image, alpha = composite(children, target.camera, target.background)
         with_ssim = iteration % settings.ssim_every == 0

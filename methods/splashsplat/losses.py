@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from splashbench_methods.splashsplat.ssim import ssim
 from torch import Tensor
+
+from splashbench.render.ssim import SsimTarget, ssim
 
 EPSILON = 1e-6
 SEPARATION_MARGIN = 0.6
@@ -48,8 +49,8 @@ def gradient_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 
 def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
-    """1 - SSIM of two [h, w, 3] images (see ssim.py)."""
-    return 1 - ssim(image, target)
+    """1 - SSIM of two [h, w, 3] images, differentiable by the first."""
+    return 1 - ssim(image, SsimTarget(target))
 
 
 def silhouette_loss(alpha: Tensor, mask: Tensor, area: float) -> Tensor:
@@ -80,4 +81,4 @@ def colour_loss(colours: Tensor, cells: Tensor, cell_sizes: Tensor) -> Tensor:
     """
     sums = colours.new_zeros(len(cell_sizes), 3).index_add_(0, cells, colours.mean(dim=1))
     means = sums / cell_sizes[:, None]
-    return ((colours - means[cells][:, None]) ** 2).mean()
+    return ((colours - means.index_select(0, cells)[:, None]) ** 2).mean()

@@ -12,9 +12,9 @@ from splashbench_methods.splashsplat.fit import composite
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.reconstruct import fit_liquid
 from splashbench_methods.splashsplat.subframe import state_at
-from splashbench_methods.splashsplat.threads import one_torch_thread
 
 from splashbench.adapter.contract import Fitted, Method, Render, Run, Support
+from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene.camera import Camera
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene

@@ -18,13 +18,13 @@ from splashbench_methods.splashsplat.fit import (
 )
 from splashbench_methods.splashsplat.model import Liquid, pack_phi, store_precision
 from splashbench_methods.splashsplat.targets import collect_targets
-from splashbench_methods.splashsplat.threads import one_torch_thread
 from splashbench_methods.splashsplat.velocity import control_shape, fit_velocity
 
 from splashbench.adapter.contract import Run
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames
 from splashbench.observe.kernels import resample
 from splashbench.observe.signed_distance import PADDING
+from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene.scene import TrainingScene
 
 Report = Callable[[float, str], None]

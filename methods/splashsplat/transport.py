@@ -10,7 +10,7 @@ import numpy as np
 from splashbench_methods.splashsplat.velocity import velocity_at
 
 from splashbench.observe.kernels import sample
-from splashbench.observe.parallel import over_range
+from splashbench.parallel import over_range
 
 MIN_STRETCH, MAX_STRETCH = 1 / 3, 3.0
 _SMALL_LOOP = 1024

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 
-from splashbench.observe.parallel import over_range
+from splashbench.parallel import over_range
 
 
 @dataclass(frozen=True)

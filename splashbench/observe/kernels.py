@@ -1,6 +1,6 @@
 """Compiled loops over grids: trilinear interpolation, and the distance to one view's silhouette cone.
 
-The loops run on several threads (parallel.py); each takes the part [start, stop) of its outermost range.
+The loops run on several threads (splashbench/parallel.py); each takes the part [start, stop) of its outermost range.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from splashbench.observe.parallel import over_range
+from splashbench.parallel import over_range
 
 _SMALL_LOOP = 4096
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.parallel import on_all_threads
 from splashbench.render import compositing, counters, projection, tiles
-from splashbench.render.workers import run_on_all
 from splashbench.scene.camera import Camera
 
 Floats = NDArray[np.float32]
@@ -84,7 +84,7 @@ def forward(
         start, stop = worker * n // workers, (worker + 1) * n // workers
         projection.project(means, covariances, opacities, colors, row, width, height, start, stop, splats, depths)
 
-    run_on_all(project)
+    on_all_threads(project)
     ids, splats, slot_starts, tile_starts, entries = tiles.sort_into_tiles(splats, depths, mask)
     # Longest lists first, dealt to the workers in turn, so that all finish at about the same time.
     order = np.argsort(-np.diff(tile_starts), kind="stable")
@@ -97,7 +97,7 @@ def forward(
             splats, tile_starts, entries, mask, order, worker, workers, behind, rgb, transmittance, last
         )
 
-    run_on_all(composite)
+    on_all_threads(composite)
     return Rendering(
         rgb, 1 - transmittance, means, covariances, opacities, row, behind, mask, ids, splats, slot_starts,
         tile_starts, entries, order, transmittance, last,
@@ -123,7 +123,7 @@ def backward(rendering: Rendering, grad_rgb: NDArray, grad_alpha: NDArray) -> tu
             r.transmittance, r.last, grad_rgb, grad_alpha, slots,
         )  # fmt: skip
 
-    run_on_all(composite)
+    on_all_threads(composite)
     n, drawn = len(r.means), len(r.ids)
     gradients = (
         np.zeros((n, 3), np.float32),
@@ -139,5 +139,5 @@ def backward(rendering: Rendering, grad_rgb: NDArray, grad_alpha: NDArray) -> tu
             *gradients,
         )  # fmt: skip
 
-    run_on_all(project)
+    on_all_threads(project)
     return gradients

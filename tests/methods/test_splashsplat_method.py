@@ -88,6 +88,22 @@ def test_particles_are_the_carriers_near_the_balls(balls: Scene, fitted: FittedS
     assert np.isfinite(particles.velocities).all()
 
 
+def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, fitted: FittedSplashSplat):
+    particles = fitted.particles()
+    births, ends = fitted.liquid.carriers.births_and_ends()
+    frame = np.arange(balls.n_frames)[:, None]
+    np.testing.assert_array_equal(particles.active, (frame >= births) & (frame <= ends))
+    assert (ends > births).mean() > 0.3  # enough of them live on for the energy to mean something
+    # Between two frames of its life a carrier moves by the velocity (at most 8 voxels) and the correction (at most 1).
+    alive = particles.active[1:] & particles.active[:-1]
+    moved = np.linalg.norm(np.diff(particles.positions, axis=0), axis=2)[alive] / fitted.liquid.grid.voxel
+    assert moved.max() <= 9.05
+    # What it does between them is what its velocity says, but for the correction.
+    predicted = particles.velocities[:-1] * np.diff(balls.times)[:, None, None]
+    off = np.linalg.norm(np.diff(particles.positions, axis=0) - predicted, axis=2)[alive] / fitted.liquid.grid.voxel
+    assert off.max() <= 1.05
+
+
 def test_particle_velocities_are_seconds_not_frames(balls: Scene, fitted: FittedSplashSplat):
     particles = fitted.particles()
     steps = np.diff(balls.times)

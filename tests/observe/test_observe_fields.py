@@ -185,7 +185,7 @@ def test_grids_of_one_box_share_their_origin():
 
 
 def test_the_same_fields_on_any_number_of_threads(monkeypatch, fields):
-    from splashbench.observe import parallel
+    from splashbench import parallel
 
     monkeypatch.setattr(parallel, "thread_count", lambda: 1)
     alone = signed_distance_fields(Ball(), cells_longest_axis=48)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.render import counters, cpu, rasterize, rasterize_arrays, workers
+from splashbench import parallel
+from splashbench.render import counters, cpu, rasterize, rasterize_arrays
 from splashbench.scene.camera import Camera
 
 
@@ -106,7 +107,7 @@ def test_images_and_gradients_repeat_bit_for_bit_on_any_number_of_threads(camera
     first = everything()
     assert everything() == first
     for threads in (1, 3):
-        monkeypatch.setattr(workers, "thread_count", lambda threads=threads: threads)
+        monkeypatch.setattr(parallel, "thread_count", lambda threads=threads: threads)
         assert everything() == first
 
 

@@ -1,8 +1,8 @@
-"""Runs a compiled loop over a range on several threads.
+"""Runs compiled kernels on several threads.
 
 The kernels release the GIL, so plain Python threads do. Numba's own parallel loops bring an OpenMP runtime that spins
-beside torch's and aborts the process when it is forked later. A kernel writes only the elements of its part of the
-range, so results do not depend on the number of threads.
+beside torch's and aborts the process when it is forked later. A kernel writes only what is its own part's, so results
+do not depend on the number of threads. A kernel must not start others: they would wait for the thread it holds.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
-# More parts than threads, because the work along an axis of the grid is uneven.
+# More parts than threads, because the work along an axis of a grid is uneven.
 _PARTS_PER_THREAD = 4
 
 
@@ -31,7 +31,7 @@ def thread_count() -> int:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="splashbench-observe")
+    return ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="splashbench")
 
 
 # Threads do not survive a fork; the child makes its own pool.
@@ -50,5 +50,14 @@ def over_range(kernel: Callable[..., None], count: int, *arguments: Any, smalles
         return
     edges = [count * part // parts for part in range(parts + 1)]
     futures = [_pool().submit(kernel, *arguments, start, stop) for start, stop in pairwise(edges)]
+    for future in futures:
+        future.result()
+
+
+def on_all_threads(kernel: Callable[[int, int], None]) -> None:
+    """Call kernel(worker, workers) for every worker and wait; the last one runs on the calling thread."""
+    workers = thread_count()
+    futures = [_pool().submit(kernel, worker, workers) for worker in range(workers - 1)]
+    kernel(workers - 1, workers)
     for future in futures:
         future.result()
