@@ -1,6 +1,6 @@
 # Everything a newcomer needs, in a virtual environment of its own (.venv). `make` alone lists the targets.
 #
-#   make demo                       make a scene, reconstruct it, score it
+#   make demo                       film a pour, reconstruct it, score it
 #   make test PYTHON=python3.12     with another interpreter (only read when .venv is made)
 
 PYTHON ?= python3
@@ -15,7 +15,7 @@ SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13)
 .PHONY: help demo test test-all lint wheel clean
 
 help:
-	@echo "make demo      make a small scene, reconstruct it and score it, into demo_output/"
+	@echo "make demo      film a made-up pour, reconstruct it and score it, into demo_output/"
 	@echo "make test      run the tests, the slow ones left out"
 	@echo "make test-all  run every test (those without a CUDA device to run on skip)"
 	@echo "make lint      check style and types"

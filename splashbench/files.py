@@ -10,11 +10,14 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import uuid
+import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,6 +30,11 @@ from splashbench.errors import DiskFullError, SplashbenchError
 MAX_JSON_BYTES = 256 << 20
 MAX_NPZ_BYTES = 4 << 30
 MAX_PIXELS = 8192 * 8192
+# Whatever a file's name says: Pillow would hand an EPS to Ghostscript.
+_IMAGE_FORMATS = ("PNG", "JPEG")
+# RuntimeError and its NotImplementedError: encrypted archives, and compressions that zipfile does not know.
+_DAMAGED = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError)
+_STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-")
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -35,59 +43,139 @@ def _sibling(path: Path) -> Path:
     return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{path.name}")
 
 
+def as_asked(path: Path | str) -> str:
+    """`path` under the name the user knows, not that of its staging place."""
+    return _STAGED.sub("", str(path))
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling of `path`; rename it onto `path` on success, remove it on any failure."""
     path = Path(path)
+    require_file_place(path)
+    made_parent = not path.parent.exists()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(path)
+    done = False
     try:
         yield temporary
         temporary.replace(path)
+        done = True
     except OSError as error:
-        _raise_if_unwritable(path, error)
+        raise_if_disk_full(path, error)
         raise
     finally:
         temporary.unlink(missing_ok=True)
+        if made_parent and not done:
+            with suppress(OSError):  # others may have written into it meanwhile
+                path.parent.rmdir()
 
 
-def _raise_if_unwritable(path: Path, error: OSError) -> None:
+def raise_if_disk_full(path: Path | str, error: OSError) -> None:
     """Turn "the disk took no more" into the one line a user needs; libraries report it in several ways."""
     no_room = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    # Pillow's encoders report a failed write by a number of their own and lose the system's.
-    encoder_failed = error.errno is None and "when writing image file" in str(error)
-    if no_room or encoder_failed:
+    # Pillow's encoders and numpy's tofile report a failed write by words of their own and lose the system's number.
+    text = str(error)
+    library_failed = error.errno is None and (
+        "when writing image file" in text or ("requested and" in text and "written" in text)
+    )
+    if no_room or library_failed:
         raise DiskFullError(
-            f"{path} could not be written: the disk is full; free some space and run the command again"
+            f"{as_asked(path)} could not be written: the disk is full; free some space and run the command again"
         ) from None
 
 
 @contextmanager
-def atomic_directory(path: Path, replace: bool = False) -> Iterator[Path]:
+def atomic_directory(
+    path: Path, replace: bool = False, *, holds: str | None = None, inputs: Sequence[Path] = ()
+) -> Iterator[Path]:
     """Yield a temporary sibling directory that becomes `path` on success and disappears on any failure.
 
-    Raises SplashbenchError when `path` exists and `replace` is false; an empty directory counts as absent.
+    Args:
+        replace: whether what is at `path` may go; an empty directory counts as absent.
+        holds: a file by which earlier outputs are told: a directory without it is never replaced.
+        inputs: what the output is made from; a place that holds one of them is never replaced.
+
+    Raises SplashbenchError where there is something at `path` that may not be replaced.
     """
-    path = Path(path).absolute()
-    if path.is_dir() and not any(path.iterdir()):
-        path.rmdir()
-    if path.exists() and not replace:
-        raise SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+    path = Path(path).resolve()  # a link stays and its target is replaced
+    _require_replaceable(path, replace, holds, inputs)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(path)
-    temporary.mkdir()
     retired = _sibling(path)
     try:
+        temporary.mkdir()
         yield temporary
+        # Again, as another process may have made its own meanwhile.
+        _require_replaceable(path, replace, holds, inputs)
         if path.exists():
             path.rename(retired)
         temporary.rename(path)
+    except OSError as error:
+        raise_if_disk_full(path, error)
+        raise
     finally:
         # A failed rename must not cost the user what was there before.
         if retired.exists() and not path.exists():
             retired.rename(path)
         for leftover in (temporary, retired):
             shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _require_replaceable(path: Path, replace: bool, holds: str | None, inputs: Sequence[Path]) -> None:
+    """Raise SplashbenchError unless an output may take the place `path`, resolved."""
+    for source in inputs:
+        if Path(source).resolve().is_relative_to(path):
+            raise SplashbenchError(f"{path} holds the input {source}; give another place for the output")
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not replace:
+        raise SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+    if not path.is_dir():
+        raise SplashbenchError(f"{path} is a file; give the name of a folder")
+    if holds is not None and not (path / holds).is_file():
+        raise SplashbenchError(f"{path} is no earlier output (it has no {holds}) and stays; give another place")
+
+
+@contextmanager
+def files_together(directory: Path) -> Iterator[Path]:
+    """Yield a temporary sibling of `directory`; on success its files move into `directory`, on failure none does.
+
+    Unlike `atomic_directory` it leaves other files in `directory` where they are.
+    """
+    directory = Path(directory)
+    require_folder_place(directory)
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    staging = _sibling(directory)
+    try:
+        staging.mkdir()
+        yield staging
+        directory.mkdir(exist_ok=True)
+        for path in sorted(staging.iterdir()):
+            path.replace(directory / path.name)
+    except OSError as error:
+        raise_if_disk_full(directory, error)
+        raise
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def require_file_place(path: Path) -> None:
+    """Raise SplashbenchError where a file cannot take the place `path`: before long work."""
+    if Path(path).is_dir():
+        raise SplashbenchError(f"{path} is a folder; give the name of a file")
+    require_folder_place(Path(path).parent)
+
+
+def require_folder_place(directory: Path) -> None:
+    """Raise SplashbenchError where `directory` is or lies below a file, or may not be written: before long work."""
+    place = Path(directory).resolve()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise SplashbenchError(f"{place} is a file; give another place for {directory}")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise SplashbenchError(f"{place} may not be written; give another place for {directory}")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -101,16 +189,28 @@ def write_json(path: Path, data: Any) -> None:
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
+def require_plain_file(path: Path) -> None:
+    """Raise SplashbenchError for a folder, a pipe or a device: reading it would fail oddly, or wait for ever.
+
+    A file that does not exist is left to the reader.
+    """
+    if path.exists() and not path.is_file():
+        raise SplashbenchError(
+            f"{path} is {'a folder' if path.is_dir() else 'a device or pipe'}, not a file; restore it"
+        )
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file. Raises SplashbenchError when it is missing, too large or not JSON."""
     path = Path(path)
     try:
+        require_plain_file(path)
         if path.stat().st_size > MAX_JSON_BYTES:
             raise SplashbenchError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB; this is not a file of ours")
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; check the path, or make the folder anew") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SplashbenchError(f"{path} cannot be read as JSON ({error}); mend or restore it") from None
 
 
@@ -122,7 +222,8 @@ def validate_model(path: Path, model: type[Model], data: Any) -> Model:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the whole file"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise SplashbenchError(f"{path}: {place}: {first['msg']}{more}; mend this entry") from None
+        fault = first["msg"].removeprefix("Value error, ")
+        raise SplashbenchError(f"{path}: {place}: {fault}{more}; mend this entry") from None
 
 
 def read_model(path: Path, model: type[Model]) -> Model:
@@ -139,15 +240,23 @@ def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of an image in pixels, from its header alone."""
     from PIL import Image, UnidentifiedImageError
 
+    path = Path(path)
     try:
-        with Image.open(path) as image:
-            size = (int(image.width), int(image.height))
+        require_plain_file(path)
+        with warnings.catch_warnings():
+            # The limit below is lower than Pillow's; one line says so.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=_IMAGE_FORMATS) as image:
+                size = (int(image.width), int(image.height))
+                mode = image.mode
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; restore the file") from None
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError, ValueError) as error:
         raise SplashbenchError(f"{path} is not a readable image ({error}); restore the file") from None
     if size[0] * size[1] > MAX_PIXELS:
         raise SplashbenchError(f"{path} is {size[0]}x{size[1]}, more than {MAX_PIXELS} pixels; scale it down")
+    if mode.startswith(("I", "F")):
+        raise SplashbenchError(f"{path} has more than 8 bits per channel; write it as an 8-bit image")
     return size
 
 
@@ -156,7 +265,7 @@ def _read_pixels(path: Path, mode: str) -> NDArray[np.uint8]:
 
     image_size(path)
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=_IMAGE_FORMATS) as image:
             return np.asarray(image.convert(mode))
     except (OSError, SyntaxError, ValueError, MemoryError) as error:
         raise SplashbenchError(f"{path} is cut short or damaged ({error}); restore the file") from None
@@ -198,6 +307,7 @@ def read_npz(path: Path, names: Mapping[str, int], optional: Mapping[str, int] |
     """
     path = Path(path)
     try:
+        require_plain_file(path)
         with zipfile.ZipFile(path) as archive:
             # The sizes are the archive's claims, but numpy's reader never inflates beyond them.
             if sum(entry.file_size for entry in archive.infolist()) > MAX_NPZ_BYTES:
@@ -210,7 +320,17 @@ def read_npz(path: Path, names: Mapping[str, int], optional: Mapping[str, int] |
             arrays = {name: archive[name] for name in wanted}
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; check the path") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError, MemoryError) as error:
+    # zipfile: RuntimeError for encrypted archives, NotImplementedError for compressions it does not know.
+    except (
+        OSError,
+        ValueError,
+        zipfile.BadZipFile,
+        EOFError,
+        KeyError,
+        MemoryError,
+        RuntimeError,
+        zlib.error,
+    ) as error:
         raise SplashbenchError(f"{path} is not a readable .npz without pickles ({error}); write it again") from None
     for name, array in arrays.items():
         if array.ndim != wanted[name]:

@@ -70,7 +70,10 @@ class Model(Fitted):
         return Render(*rasterize_arrays(points, covariances, opacities, colours, camera, background=self.background))
 
     def particles(self) -> Particles:
-        return Particles(self.positions, self.active)
+        # Points are drawn anew in every frame. Even and odd frames take rows of their own, so that no row claims to be
+        # one particle followed from a frame to the next.
+        own = np.arange(len(self.positions))[:, None] % 2 == np.arange(2).repeat(self.positions.shape[1])
+        return Particles(np.tile(self.positions, (1, 2, 1)), np.tile(self.active, (1, 2)) & own)
 
     def save(self, directory: Path) -> None:
         np.savez(directory / "model.npz", **{name: getattr(self, name) for name in self.ARRAYS})

@@ -54,11 +54,14 @@ def _forecast(
 
 def clamp_stretch(deformation: np.ndarray) -> np.ndarray:
     """Deformation gradients [N, 3, 3] with their singular values clamped to [1/3, 3], float32."""
-    if len(deformation) == 0:
-        return deformation.astype(np.float32)
-    left, stretch, right = np.linalg.svd(deformation)
-    clamped = (left * np.clip(stretch, MIN_STRETCH, MAX_STRETCH)[:, None, :]) @ right
-    return clamped.astype(np.float32)
+    clamped = deformation.astype(np.float32)
+    # The largest singular value is at most |F|, the smallest at least 2 |det F| / |F|^2, as the product of the other
+    # two is at most |F|^2 / 2: most carriers need no decomposition.
+    square = (deformation**2).sum(axis=(1, 2))
+    doubtful = ~((square <= MAX_STRETCH**2) & (2 * np.abs(np.linalg.det(deformation)) >= MIN_STRETCH * square))
+    left, stretch, right = np.linalg.svd(deformation[doubtful])
+    clamped[doubtful] = (left * np.clip(stretch, MIN_STRETCH, MAX_STRETCH)[:, None, :]) @ right
+    return clamped
 
 
 def forecast(

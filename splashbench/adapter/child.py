@@ -19,12 +19,14 @@ from splashbench.adapter.contract import Fitted, Method, Render, Run
 from splashbench.adapter.discovery import load_method
 from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
 from splashbench.errors import DiskFullError, SplashbenchError
-from splashbench.files import read_model, write_model
+from splashbench.files import raise_if_disk_full, read_model, write_model
+from splashbench.processes import end_with_parent
 from splashbench.scene import Camera, Particles, Scene, TrainingScene
 from splashbench.submission import Status, to_8bit, write_view
 from splashbench.submission.exr import write_exr
 
 WARM_UP_FRAMES = 10
+_OVERSHOOT = 0.5
 
 
 class Failure(Exception):
@@ -38,6 +40,7 @@ class Failure(Exception):
 def main(request_path: str) -> int:
     """Carry out the request; always leaves an Outcome behind unless the process dies."""
     request = read_model(Path(request_path), Request)
+    end_with_parent(request.harness)
     phase: Callable[[Request, Method, TrainingScene], Outcome] = _fit if request.phase == "fit" else _render
     try:
         method = load_method(request.method)
@@ -47,10 +50,13 @@ def main(request_path: str) -> int:
     except MemoryError as error:
         outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=f"out of memory {error}".strip())
     except DiskFullError as error:
-        # Not the method's failure: the parent reads this last line and tells the user.
-        print(error, file=sys.stderr)
-        return DISK_FULL_EXIT
+        return _disk_full(error)
     except Exception as error:
+        if isinstance(error, OSError):
+            try:  # a writer of the method's own
+                raise_if_disk_full(error.filename or request.model, error)
+            except DiskFullError as full:
+                return _disk_full(full)
         if "out of memory" in str(error).lower():
             outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=_one_line(error))
         else:
@@ -60,6 +66,12 @@ def main(request_path: str) -> int:
             outcome = Outcome(status=Status.CRASHED, reason=_one_line(error))
     write_model(Path(request.result), outcome)
     return 0
+
+
+def _disk_full(error: DiskFullError) -> int:
+    """Not the method's failure: the parent reads this last line and tells the user."""
+    print(error, file=sys.stderr)
+    return DISK_FULL_EXIT
 
 
 def _one_line(error: BaseException) -> str:
@@ -120,6 +132,7 @@ def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
     known = [count for count in counts if count is not None]
     return Outcome(
         render_fps=_frame_rate(fitted, scene, request.timing_frames),
+        timed_frames=request.timing_frames,
         primitives_per_frame=statistics.fmean(known) if known else None,
         peak_device_memory_bytes=_device_peak(),
     )
@@ -138,6 +151,11 @@ def _checked(render: Render, camera: Camera, t: int) -> Render:
         )
     if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
         raise Failure(Status.NOT_FINITE, f"{where}: the render has NaN or infinite pixels")
+    for name, values in (("rgb", rgb), ("alpha", alpha)):
+        # A little over is clipped; integers, or 0 to 255, are a mistake that clipping would hide as a white image.
+        if values.dtype.kind != "f" or values.min() < -_OVERSHOOT or values.max() > 1 + _OVERSHOOT:
+            found = f"{values.dtype} from {values.min():g} to {values.max():g}"
+            raise Failure(Status.OUT_OF_RANGE, f"{where}: {name} is {found}, not floats in [0, 1]")
     return Render(rgb, alpha)
 
 

@@ -74,7 +74,7 @@ class Run:
 class MethodConfig(BaseModel):
     """Settings of a method. Subclass it with fields and fill `presets`: name -> the fields that differ."""
 
-    model_config = ConfigDict(extra="forbid", validate_assignment=True)
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"best": {}}
 
     @classmethod
@@ -116,6 +116,8 @@ class Method(ABC):
     title: ClassVar[str]
     version: ClassVar[str] = "1"
     Config: ClassVar[type[MethodConfig]] = MethodConfig
+    #: What `Run.device` may be; a GPU method lists "cuda" too.
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)
     #: True for the yardsticks that are no reconstructions (methods/controls).
     control: ClassVar[bool] = False
     #: True where one set of primitives holds background and liquid, see docs/protocol.md, "mixed methods".

@@ -8,12 +8,14 @@ import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from splashbench.adapter.contract import Method
+from splashbench.adapter.contract import Method, MethodConfig
 from splashbench.errors import SplashbenchError
 
 GROUP = "splashbench.methods"
 #: Written by the harness itself, since no method sees a test image (adapter/oracle.py).
 ORACLE = "oracle"
+# What a stranger's module may raise: a script that was taken for a method calls sys.exit().
+_ANYTHING = (Exception, SystemExit)
 
 
 def registered() -> dict[str, EntryPoint]:
@@ -34,9 +36,14 @@ def load_method(name: str) -> Method:
         hint = f"did you mean {near[0]!r}?" if near else "see `splashbench methods list`"
         raise SplashbenchError(f"there is no method {name!r}; {hint}")
     try:
-        return _checked(points[name].load(), name)
+        method_class = points[name].load()
     except ImportError as error:
         raise SplashbenchError(f"method {name!r} cannot be imported ({error}); install what it needs") from None
+    except _ANYTHING as error:
+        raise SplashbenchError(
+            f"method {name!r} cannot be imported ({type(error).__name__}: {error}); mend or remove its package"
+        ) from None
+    return _checked(method_class, name)
 
 
 def _from_file(name: str) -> Method:
@@ -52,7 +59,7 @@ def _from_file(name: str) -> Method:
     sys.modules[module_name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except _ANYTHING as error:
         raise SplashbenchError(f"{path} cannot be imported ({type(error).__name__}: {error}); mend it") from None
     if not hasattr(module, class_name):
         raise SplashbenchError(f"{path} has no class {class_name!r}; name the method's class after the colon")
@@ -68,4 +75,10 @@ def _checked(method_class: type, name: str) -> Method:
             missing.append(attribute)
     if missing:
         raise SplashbenchError(f"method {name!r} lacks {', '.join(missing)}; see CONTRIBUTING.md")
-    return method_class()
+    config = method_class.Config
+    if not (isinstance(config, type) and issubclass(config, MethodConfig) and config.presets):
+        raise SplashbenchError(f"the Config of method {name!r} is no MethodConfig with a preset; see CONTRIBUTING.md")
+    try:
+        return method_class()
+    except _ANYTHING as error:
+        raise SplashbenchError(f"method {name!r} cannot be made ({type(error).__name__}: {error}); mend it") from None

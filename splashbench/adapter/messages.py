@@ -17,6 +17,8 @@ class Request(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     phase: Literal["fit", "render"]
+    #: The process that waits for the child, and without which the child must not go on.
+    harness: int
     method: str
     scene: str
     preset: str
@@ -41,6 +43,7 @@ class Outcome(BaseModel):
     reason: str = ""
     seconds: float | None = None
     render_fps: float | None = None
+    timed_frames: int | None = None
     primitives_per_frame: float | None = None
     peak_device_memory_bytes: int | None = None
     settings: dict[str, Any] = {}

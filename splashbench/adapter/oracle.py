@@ -14,13 +14,13 @@ from splashbench.adapter import hardware
 from splashbench.files import atomic_directory
 from splashbench.progress import track
 from splashbench.scene import Scene
-from splashbench.submission import Identity, Record, Submission, seal, write_view
+from splashbench.submission import IDENTITY, Identity, Record, Submission, seal, write_view
 from splashbench.version import __version__
 
 
 def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
     """Write the oracle's submission for `scene` into `out`."""
-    with atomic_directory(out, replace=replace) as staging:
+    with atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene.directory]) as staging:
         for t in track(range(scene.n_frames), "oracle"):
             for name in scene.test:
                 mask = np.where(scene.mask(name, t), 255, 0).astype(np.uint8)

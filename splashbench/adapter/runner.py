@@ -6,12 +6,16 @@ every case: with renders when the run is `ok`, else with a status and a reason.
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from splashbench.adapter import hardware
+from splashbench.adapter.contract import Method
 from splashbench.adapter.discovery import ORACLE, load_method
 from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
 from splashbench.adapter.process import Watched, run_watched
@@ -19,7 +23,7 @@ from splashbench.adapter.training_view import make_training_view
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import atomic_directory, read_model, tree_bytes, write_model
 from splashbench.scene import Particles, Scene
-from splashbench.submission import Identity, Record, Status, Submission, seal
+from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
 from splashbench.version import __version__
 
 #: Protocol v1: the frame rate is the median of at least this many renders.
@@ -55,31 +59,36 @@ def run_method(
     """
     scene = Scene.open(scene_directory)
     if name == ORACLE:
+        if preset or overrides:
+            raise SplashbenchError("the oracle is the truth itself, without presets or settings; leave them out")
         from splashbench.adapter.oracle import write_oracle
 
         return write_oracle(scene, out, replace=replace)
     method = load_method(name)
+    if device not in method.devices:
+        known = ", ".join(method.devices)
+        raise SplashbenchError(f"method {method.id} runs on {known}, not on {device!r}; leave --device out")
     preset = preset or next(iter(method.Config.presets))
     config = method.Config.preset(preset, overrides)
-    identity = Identity(
-        method=method.id,
-        method_version=method.version,
+    identity = _identity(
+        method,
         preset=preset,
         settings=without_nulls(config.model_dump(mode="json")),
         seed=seed,
+        device=device,
         scene=scene.name,
         scene_digest=scene.digest,
-        control=method.control,
-        mixed=method.mixed,
-        splashbench_version=__version__,
-        hardware=hardware.describe(),
     )
-    with atomic_directory(out, replace=replace) as staging, tempfile.TemporaryDirectory() as scratch:
+    with (
+        atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene_directory]) as staging,
+        tempfile.TemporaryDirectory() as scratch,
+    ):
         record = _run_phases(
             Path(scratch),
             staging,
             Request(
                 phase="fit",
+                harness=os.getpid(),
                 method=name,
                 scene=str(make_training_view(scene, Path(scratch, "scene"))),
                 preset=preset,
@@ -102,8 +111,44 @@ def run_method(
             for name_ in ("renders", "alpha", "exr"):
                 _remove_tree(staging / name_)
             (staging / "particles.npz").unlink(missing_ok=True)
+        _require_unchanged(scene, method)
         seal(staging, identity, record)
     return Submission.open(out)
+
+
+def _identity(method: Method, **run: Any) -> Identity:
+    """What the submission will say of itself; whatever cannot be written is found before hours go into a fit."""
+    try:
+        identity = Identity(
+            method=method.id,
+            method_version=method.version,
+            control=method.control,
+            mixed=method.mixed,
+            splashbench_version=__version__,
+            hardware=hardware.describe(),
+            **run,
+        )
+        identity_text(identity)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SplashbenchError(
+            f"method {method.id!r}: {first['loc'][0]}: {first['msg']}; mend it in {type(method).__name__}"
+        ) from None
+    except TypeError as error:
+        raise SplashbenchError(f"method {method.id!r}: TOML cannot say its settings ({error}); mend them") from None
+    return identity
+
+
+def _require_unchanged(scene: Scene, method: Method) -> None:
+    """Raise SplashbenchError where `scene` is no longer what it was: the method's view of it is links."""
+    try:
+        same = Scene.open(scene.directory).digest == scene.digest
+    except SplashbenchError:
+        same = False
+    if not same:
+        raise SplashbenchError(
+            f"{scene.directory} was changed while {method.id} ran, maybe by the method; restore it and run again"
+        )
 
 
 def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
@@ -137,6 +182,7 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     return record.model_copy(
         update={
             "render_fps": outcome.render_fps,
+            "timed_frames": outcome.timed_frames,
             "primitives_per_frame": outcome.primitives_per_frame,
             "carriers_per_frame": carriers,
         }
@@ -209,11 +255,13 @@ def parse_overrides(pairs: list[str]) -> dict[str, Any]:
             raise SplashbenchError(f"--set {pair!r} is not KEY=VALUE; see `splashbench methods show METHOD`")
         try:
             value = json.loads(text)
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):
             value = text
         *parents, leaf = key.split(".")
         node = settings
         for parent in parents:
             node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise SplashbenchError(f"--set {pair!r} sets a part of {parent}, to which another --set gives a value")
         node[leaf] = value
     return settings

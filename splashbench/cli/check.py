@@ -30,11 +30,17 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench check`."""
+    from splashbench.errors import one_line
     from splashbench.scene import Scene
-    from splashbench.submission import check_submission
+    from splashbench.submission import Status, Submission, check_submission
 
     scene = Scene.open(arguments.scene) if arguments.scene else None
     faults = check_submission(arguments.submission, scene)
+    if not faults:
+        # Whole, but nothing to score: a person who checks wants to know.
+        record = Submission.open(arguments.submission, verify=False).record
+        if record.status != Status.OK:
+            say(f"{arguments.submission}: the run ended with status {record.status.value}: {one_line(record.reason)}")
     if arguments.json:
         emit({"submission": str(arguments.submission), "ok": not faults, "faults": faults})
     for fault in faults:

@@ -20,8 +20,11 @@ _EPILOG = """\
 example:
   splashbench demo demo_output
 
-About ten minutes on two cores. Look at demo_output/README.txt afterwards.
+Seven minutes on two shared cores of a server. Look at demo_output/README.txt afterwards.
 """
+
+#: In the folder of a demo, begun or whole.
+_MARK = ".splashbench_demo"
 
 #: id, preset and further options of the runs; the oracle is written by the harness.
 _RUNS: tuple[tuple[str, list[str]], ...] = (
@@ -43,10 +46,16 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("out", type=Path, help="folder for everything the demo makes")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the made-up pour and of the methods")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the made-up pour and of the methods")
     parser.add_argument("--fresh", action="store_true", help="make everything anew, also what is there already")
     add_json(parser)
     parser.set_defaults(handler=run)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
+    return int(text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -55,6 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     start = time.monotonic()
     out: Path = arguments.out
+    _claim(out)
     seed = ["--seed", str(arguments.seed)]
     session, scene, truth, results = out / "session", out / "scene", out / "verify.json", out / "results"
     sheet, runs = out / "contact_sheet.png", {name: out / "submissions" / name for name, _ in _RUNS}
@@ -87,6 +97,17 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({"out": str(out), "passed": all(gate.passed for gate in gates), "gates": [vars(gate) for gate in gates]})
     return 0 if all(gate.passed for gate in gates) else 1
+
+
+def _claim(out: Path) -> None:
+    """Mark `out` as the demo's own. What it makes anew it removes first, so another folder must not be taken for it."""
+    from splashbench.errors import SplashbenchError
+    from splashbench.files import require_folder_place, write_text
+
+    require_folder_place(out)
+    if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
+        raise SplashbenchError(f"{out} holds files that are not the demo's; give a new or an empty folder")
+    write_text(out / _MARK, "Made by `splashbench demo`, which may replace everything here.\n")
 
 
 class _Steps:

@@ -35,13 +35,17 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench leaderboard`."""
+    from splashbench.files import files_together
     from splashbench.report.charts import speed_accuracy_chart
     from splashbench.report.leaderboard import leaderboard_rows, write_leaderboard
     from splashbench.report.results import load_results
 
     sources = load_results(arguments.results)
-    files = write_leaderboard(sources, arguments.out)
-    files += speed_accuracy_chart(sources, arguments.out, with_paper=arguments.with_paper)
+    # All four or none: a table without its chart would be taken for whole.
+    with files_together(arguments.out) as staging:
+        made = write_leaderboard(sources, staging)
+        made += speed_accuracy_chart(sources, staging, with_paper=arguments.with_paper)
+    files = [arguments.out / path.name for path in made]
     rows = leaderboard_rows(sources)
     failed = sum(not row.ok for row in rows)
     say(f"{len(sources)} results, {len(rows)} rows{f', {failed} of them failed runs' if failed else ''}")

@@ -1,7 +1,8 @@
 """The command line `splashbench`: a thin shell around the library, one module per command.
 
 Command modules import what they need inside their handlers, so that `--help` answers at once. Exit status: 0 done,
-1 failed with one line saying what and what to do, 2 wrong usage.
+1 failed with one line saying what and what to do, 2 wrong usage; 130 interrupted, 143 terminated, 141 the reader of its
+output went away.
 """
 
 from __future__ import annotations
@@ -9,9 +10,13 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
+import warnings
+from contextlib import suppress
 
-from splashbench.errors import SplashbenchError
+from splashbench.errors import SplashbenchError, one_line
+from splashbench.processes import Terminated, terminable
 from splashbench.version import __version__
 
 #: In the order of the work: session, scene, method, submission, result.
@@ -47,25 +52,51 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     # Idle OpenMP threads that spin steal cores from the renderer's own; the user's choice wins.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    arguments = build_parser().parse_args(argv)
+    # Started with closed streams, as some schedulers do, Python has none.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    # A name in letters that the charts' font lacks is drawn as boxes; that is no news for the terminal.
+    warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
     try:
-        return int(arguments.handler(arguments))
+        with terminable():
+            arguments = build_parser().parse_args(argv)
+            status = int(arguments.handler(arguments))
+            sys.stdout.flush()
+            return status
     except SplashbenchError as error:
         return _fail(str(error))
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("\ninterrupted; nothing half-written was left", file=sys.stderr)
-        return 130
+        return 128 + (error.signum if isinstance(error, Terminated) else signal.SIGINT)
     except BrokenPipeError:
-        # The reader of our output went away (`| head`); Python would complain again while closing.
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
-        return 0
+        # The reader of our output went away (`| head`): the status that a shell gives to any tool then.
+        _drop_output()
+        return 141
+    except MemoryError as error:
+        return _fail(f"out of memory ({error}); close other programs, or work on smaller images or fewer at once")
     except OSError as error:
-        name = error.filename if error.filename is not None else "a file"
+        from splashbench.files import as_asked
+
+        name = "a file" if error.filename is None else as_asked(os.fsdecode(error.filename))
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _drop_output()
+            name = "standard output"
         return _fail(f"{name}: {error.strerror or error}; check the path, its permissions and the space on the disk")
 
 
+def _drop_output() -> None:
+    """Send what is left in standard output's buffer nowhere; Python would complain again while closing."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):  # no real stream, as in a test
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+
+
 def _fail(message: str) -> int:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    with suppress(BrokenPipeError):
+        print(f"error: {one_line(message)}", file=sys.stderr)
     return 1
 
 

@@ -73,8 +73,11 @@ def list_methods(arguments: argparse.Namespace) -> int:
 
 def show_method(arguments: argparse.Namespace) -> int:
     """Handle `splashbench methods show`."""
-    from splashbench.adapter.discovery import load_method
+    from splashbench.adapter.discovery import ORACLE, load_method
+    from splashbench.errors import SplashbenchError
 
+    if arguments.method == ORACLE:
+        raise SplashbenchError("the oracle is written by the harness and has no settings; just run it")
     method = load_method(arguments.method)
     default = next(iter(method.Config.presets))
     facts = _facts(arguments.method)

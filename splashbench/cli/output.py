@@ -16,8 +16,9 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def say(text: str = "") -> None:
-    """Tell a person, on standard error."""
-    print(text, file=sys.stderr, flush=True)
+    """Tell a person, on standard error; control characters, which may come from strangers' files, are replaced."""
+    shown = "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
+    print(shown, file=sys.stderr, flush=True)
 
 
 def emit(data: dict[str, Any]) -> None:

@@ -17,6 +17,9 @@ static scene with the board lying flat on the table, and the pour with sound; an
 SCENE appears only when every essential gate is passed; its prepare_report.html shows what was found.
 """
 
+# As in session.toml (splashbench.prepare.session), repeated here so that `--help` need not import it.
+_MOST_TIMESTEPS = 10_000
+
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
@@ -51,10 +54,9 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 
 def _at_least_two(text: str) -> int:
-    value = int(text)
-    if value < 2:
-        raise argparse.ArgumentTypeError("at least two timesteps make a motion")
-    return value
+    if not (text.isdecimal() and 2 <= int(text) <= _MOST_TIMESTEPS):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 2 to {_MOST_TIMESTEPS}")
+    return int(text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -65,8 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
     interval = None
     if arguments.interval is not None:
         interval = (arguments.interval[0], arguments.interval[1])
-        if not interval[0] < interval[1]:
-            raise SplashbenchError(f"--interval {interval[0]} {interval[1]}: START must come before END")
+        if not -1e6 < interval[0] < interval[1] < 1e6:
+            raise SplashbenchError(f"--interval {interval[0]} {interval[1]}: give seconds, START before END")
     options = Options(
         masks=arguments.masks,
         timesteps=arguments.timesteps,

@@ -16,6 +16,7 @@ examples:
   splashbench run my_method.py:MyMethod SCENE OUT   a method that is not installed (CONTRIBUTING.md)
 
 A method that crashes, hangs, runs out of memory or returns NaN gives a submission with that status, and exit status 1.
+It is a program with your rights: run a stranger's method in a container.
 """
 
 
@@ -33,11 +34,14 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("out", type=Path, help="folder of the submission, made by the run")
     parser.add_argument("--preset", help="settings by name; see `splashbench methods show METHOD`")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
-    parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (default 0)")
+    parser.add_argument("--seed", type=_not_negative, default=0, help="seed of every random choice (default 0)")
     parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can")
-    parser.add_argument("--timeout", type=float, metavar="SECONDS", help="limit for the fit, and for the rendering")
+    parser.add_argument("--timeout", type=_seconds, metavar="SECONDS", help="limit for the fit, and for the rendering")
     parser.add_argument(
-        "--timing-frames", type=int, default=None, metavar="N", help="frames timed for FPS (default 100; 0: none)"
+        "--timing-frames",
+        type=_not_negative,
+        metavar="N",
+        help="frames timed for FPS (default 100; of fewer it is not scored)",
     )
     parser.add_argument("--exr", action="store_true", help="write the renders also as OpenEXR, for compositing")
     parser.add_argument("--no-model", action="store_true", help="do not keep the fitted model under OUT/model")
@@ -46,9 +50,26 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.set_defaults(handler=run)
 
 
+def _not_negative(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
+    return seconds
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench run`."""
     from splashbench.adapter.runner import TIMING_FRAMES, parse_overrides, run_method
+    from splashbench.errors import one_line
 
     submission = run_method(
         arguments.method,
@@ -69,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         emit(submission.identity.model_dump(mode="json") | record.model_dump(mode="json"))
     if record.status.value != "ok":
         say(
-            f"error: {submission.identity.method}: {record.status.value}: {record.reason}; "
+            f"error: {submission.identity.method}: {record.status.value}: {one_line(record.reason)}; "
             f"see {arguments.out / 'record.json'}"
         )
         return 1

@@ -55,11 +55,15 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench score`."""
+    from splashbench.files import require_file_place, require_folder_place
     from splashbench.scene import Scene
     from splashbench.score import score_submission, shared_fields
     from splashbench.submission import Submission
 
     protocol = _protocol(arguments.changes)
+    require_folder_place(arguments.out)
+    if arguments.sheet:
+        require_file_place(arguments.sheet)
     scene = Scene.open(arguments.scene)
     # All are opened, hence verified, before hours may go into scoring the first.
     submissions = [Submission.open(path) for path in arguments.submissions]
@@ -117,6 +121,7 @@ def _protocol(changes: list[str]) -> Protocol:
 
 
 def _summary(results: list[Result]) -> str:
+    from splashbench.errors import one_line
     from splashbench.score import METRICS
     from splashbench.score.metrics import format_value
 
@@ -134,6 +139,8 @@ def _summary(results: list[Result]) -> str:
     }
     lines += [f"null {reason}" for reason in sorted(missing)]
     lines += [
-        f"{result.method} failed: {result.reason or result.status}" for result in results if result.status != "ok"
+        f"{result.method} failed: {one_line(result.reason) or result.status}"
+        for result in results
+        if result.status != "ok"
     ]
     return "\n".join(lines)

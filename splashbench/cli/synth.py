@@ -30,6 +30,7 @@ examples:
 # that needs no simulation.
 _BALLS = "balls"
 _SCENES = (_BALLS, "opaque_bowl", "thin_stream", "still_pool")
+_LONGEST_SIDE = 8192
 _VERIFY_EPILOG = """\
 example:
   splashbench synth verify sessions/made_up scenes/made_up --json
@@ -65,7 +66,9 @@ def _register_session(kinds: argparse._SubParsersAction) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="folder to be made")
     parser.add_argument("--size", type=_size, default=(480, 270), metavar="WxH", help="of frames (default: 480x270)")
     parser.add_argument("--fps", type=int, default=60, help="frames per second of the cameras (default: 60)")
-    parser.add_argument("--seed", type=int, default=0, help="decides lenses, poses, clocks and sounds (default: 0)")
+    parser.add_argument(
+        "--seed", type=_not_negative, default=0, help="decides lenses, poses, clocks and sounds (default: 0)"
+    )
     parser.add_argument(
         "--duration", type=float, default=2.0, metavar="SECONDS", help="of the liquid's motion (default: 2.0)"
     )
@@ -93,7 +96,7 @@ def _register_scene(kinds: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--particle-radius", type=float, metavar="METRES", help="of the simulation (default: as fits the scene)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="decides poses, lenses and noise (default: 0)")
+    parser.add_argument("--seed", type=_not_negative, default=0, help="decides poses, lenses and noise (default: 0)")
     parser.add_argument("--replace", action="store_true", help="replace OUT where it exists")
     add_json(parser)
     parser.set_defaults(handler=run_scene)
@@ -117,14 +120,22 @@ def _register_verify(kinds: argparse._SubParsersAction) -> None:
 
 def _size(text: str) -> tuple[int, int]:
     width, separator, height = text.lower().partition("x")
-    if not (separator and width.isdigit() and height.isdigit()):
+    if not (separator and width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text!r} is no size; write it like 480x270")
+    if not (0 < int(width) <= _LONGEST_SIDE and 0 < int(height) <= _LONGEST_SIDE):
+        raise argparse.ArgumentTypeError(f"{text!r} will not do; give 1x1 to {_LONGEST_SIDE}x{_LONGEST_SIDE}")
     return int(width), int(height)
 
 
 def _positive(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
+    if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
+def _not_negative(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
     return int(text)
 
 

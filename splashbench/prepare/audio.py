@@ -55,7 +55,8 @@ def decode_audio(
     with open_media(path) as container:
         if not container.streams.audio:
             raise SplashbenchError(
-                f"{path} has no audio track, and cameras are synchronised by sound; record with the microphone on"
+                f"{path} has no audio track, and cameras are synchronised by sound; record with the microphone on, "
+                "or copy the file from the camera again if it was"
             )
         for frame in container.decode(container.streams.audio[0]):
             native = native or int(frame.sample_rate)

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, sha256_file, write_json, write_text
 from splashbench.prepare import gates as g
 from splashbench.prepare import masking, metric, motion, rig, sampling, sync
@@ -62,7 +63,11 @@ def prepare(session_directory: Path, scene_directory: Path, options: Options | N
     """
     options = options or Options()
     session = Session.open(session_directory)
-    with atomic_directory(scene_directory, replace=options.replace) as made:
+    if options.masks not in (None, "background") and not Path(options.masks).is_dir():
+        raise SplashbenchError(f"{options.masks} is not a folder of masks; give one, or --masks background")
+    with atomic_directory(
+        scene_directory, replace=options.replace, holds="train_meta.json", inputs=[session_directory]
+    ) as made:
         with tempfile.TemporaryDirectory(prefix="splashbench-prepare-") as work:
             preparation = _Run(session, options, Path(work)).into(made)
         write_json(made / "prepare_report.json", preparation.as_json())
@@ -102,7 +107,12 @@ class _Run:
             recordings.check_sizes(lenses, pour)
         with self._stage("poses"):
             static, sweep = recordings.static_images(), recordings.sweep_images()
-            found = rig.find_poses(static, sweep, lenses, recordings.detector, self._folder("sfm"))
+            try:
+                found = rig.find_poses(static, sweep, lenses, recordings.detector, self._folder("sfm"))
+            except RuntimeError as error:  # COLMAP's, for one when its database finds the disk full
+                raise SplashbenchError(
+                    f"{session.directory}: COLMAP failed ({error}); check the space in {tempfile.gettempdir()}"
+                ) from None
         with self._stage("metric"):
             frame = rig.find_metres(static, sweep, lenses, found, recordings.detector)
             placed = metric.transformed(found, frame.scene_from_sfm)

@@ -84,7 +84,7 @@ class Session(_Strict):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,99}$")
     cameras: list[str] = Field(min_length=2, max_length=100)
     train: list[str] = Field(min_length=1)
-    test: list[str] = Field(default_factory=list)
+    test: list[str] = Field(min_length=1)
     timesteps: int = Field(default=50, ge=2, le=10_000)
     motion_interval: tuple[float, float] | None = None
     board: Board | None = None
@@ -140,9 +140,15 @@ class Session(_Strict):
         session = validate_model(path, cls, toml.load(path))
         session._directory = directory
         for kind in ("pour", "static", "intrinsics"):
+            known: dict[Path, str] = {}
             for camera, chapters in getattr(session.recordings, kind).items():
                 for chapter in chapters:
                     session._check(chapter, f"the {kind} recording of camera {camera}")
+                    other = known.setdefault((directory / chapter).resolve(), camera)
+                    if other != camera or chapters.count(chapter) > 1:
+                        raise SplashbenchError(
+                            f"{path}: {chapter} is listed twice in [recordings.{kind}]; list every file once"
+                        )
         for chapter in session.sweep.files if session.sweep else ():
             session._check(chapter, "the sweep")
         if session.masks.folder is not None:

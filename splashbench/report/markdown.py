@@ -26,6 +26,9 @@ _COST_UNITS = {
 _NONE = "–"
 
 
+_NOT_RANKED = ("sigma_d", "mu_d")
+
+
 def to_markdown(rows: Sequence[Row], sources: Sequence[Source]) -> str:
     """The whole document. `rows` as ordered by `leaderboard_rows`."""
     machines = sorted({hardware_label(row.first.hardware) for row in rows})
@@ -81,7 +84,8 @@ def _best(name: str, rows: list[Row]) -> float | None:
     """The best value among the rows that are no controls, where there are two to compare."""
     values = [value for row in rows if not row.first.control and (value := row.value(name)) is not None]
     better = METRICS[name].better
-    if len(values) < 2 or better is None:
+    # A low sigma_D is had by shrinking the cloud (protocol: rank by the uniformity index), so nothing wins by it.
+    if len(values) < 2 or better is None or name in _NOT_RANKED:
         return None
     return max(values) if better == "higher" else min(values)
 

@@ -11,6 +11,10 @@ from typing import Any
 from splashbench.errors import SplashbenchError
 from splashbench.score.result import Result
 
+#: Figures that are charted, with the least each can be; no figure comes near the most.
+_CHARTED = {"psnr": -1e15, "lpips": 0.0, "miou": 0.0, "fit_seconds": 0.0}
+_MOST = 1e15
+
 
 @dataclass(frozen=True)
 class Source:
@@ -28,19 +32,48 @@ def load_results(location: Path) -> list[Source]:
     is none.
     """
     location = Path(location)
+    if (location / "submission.toml").is_file():
+        raise SplashbenchError(f"{location} is a submission, not results; score it first with `splashbench score`")
     files = [location] if location.is_file() else sorted(location.rglob("*.json"))
-    files = [path for path in files if not path.name.startswith(".")]
+    # What a killed process left behind has a name that begins with a dot, and so has a folder of such.
+    files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(location).parts)]
     if not files:
         raise SplashbenchError(f"{location} holds no results (*.json); make some with `splashbench score`")
     root = location.parent if location.is_file() else location
     kept: dict[tuple[str, ...], Source] = {}
     for path in files:
-        source = Source(path.relative_to(root).as_posix(), Result.load(path))
+        source = Source(path.relative_to(root).as_posix(), _plausible(path, Result.load(path)))
         digests = source.result.digests
         key = (digests.scene, digests.submission, digests.protocol)
         if key not in kept or _known(source.result) > _known(kept[key].result):
             kept[key] = source
-    return sorted(kept.values(), key=lambda source: (*_order(source.result), source.path))
+    sources = sorted(kept.values(), key=lambda source: (*_order(source.result), source.path))
+    _refuse_repeats(sources)
+    return sources
+
+
+def _refuse_repeats(sources: list[Source]) -> None:
+    """Two submissions of one method, settings, scene and seed are an old and a new run, not a spread over seeds."""
+    seen: dict[tuple[str, ...], Source] = {}
+    for source in sources:
+        result = source.result
+        same = (result.digests.scene, result.digests.protocol, result.method, result.preset)
+        key = (*same, str(result.seed), settings_digest(result), hardware_label(result.hardware))
+        if key in seen:
+            raise SplashbenchError(
+                f"{seen[key].path} and {source.path} are two runs of {result.method} with one seed and the same "
+                "settings; remove the older one, or raise the method's version"
+            )
+        seen[key] = source
+
+
+def _plausible(path: Path, result: Result) -> Result:
+    """`result`, unless a figure is one that no score has and no chart can hold."""
+    for name, least in _CHARTED.items():
+        value = result.value(name)
+        if value is not None and not least <= value <= _MOST:
+            raise SplashbenchError(f"{path}: metrics.{name} is {value:g}, which no run has; score the submission again")
+    return result
 
 
 def _known(result: Result) -> int:

@@ -113,16 +113,19 @@ def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) 
 
 
 def machines(sources: Sequence[Source]) -> list[Machine]:
-    """The measured results by machine, in order of name; controls and failed runs set apart, none dropped."""
-    by_machine: dict[str, list[Result]] = defaultdict(list)
+    """The measured results by machine and protocol, in order of name; controls and failed runs set apart, none dropped.
+
+    Figures of a changed protocol are other figures: they never share a panel with v1's.
+    """
+    by_machine: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for source in sources:
-        by_machine[hardware_label(source.result.hardware)].append(source.result)
-    return [_machine(title, results) for title, results in sorted(by_machine.items())]
+        by_machine[hardware_label(source.result.hardware), source.result.protocol.label].append(source.result)
+    return [_machine(title, protocol, results) for (title, protocol), results in sorted(by_machine.items())]
 
 
-def _machine(title: str, results: list[Result]) -> Machine:
+def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
     scenes = len({result.digests.scene for result in results})
-    machine = Machine(f"{title} · {scenes} scene{'' if scenes == 1 else 's'}, {_protocols(results)}", scenes)
+    machine = Machine(f"{title} · {scenes} scene{'' if scenes == 1 else 's'}, protocol {protocol}", scenes)
     entries: dict[str, Entry] = {}
     controls: dict[str, list[dict[str, float]]] = defaultdict(list)
     names = _labels(results)
@@ -148,10 +151,6 @@ def _machine(title: str, results: list[Result]) -> Machine:
             name: float(np.mean([run[name] for run in runs if name in run])) for name in sorted(known)
         }
     return machine
-
-
-def _protocols(results: list[Result]) -> str:
-    return "protocol " + ", ".join(sorted({result.protocol.label for result in results}))
 
 
 def _key(result: Result) -> tuple[str, str, str]:

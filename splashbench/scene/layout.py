@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_json, validate_model
+from splashbench.files import MAX_PIXELS, read_json, validate_model
 
 # A camera folder and a file in it, and nothing that could lead out of `ims/`.
 _IMAGE_PATH = re.compile(r"[A-Za-z0-9_][\w-]*/[A-Za-z0-9_][\w.-]*\.(?:jpg|jpeg|png|JPG|PNG)")
 # The cameras are bolted down; anything beyond rounding is a moving camera, which nothing here supports.
 _STATIC_TOLERANCE = 1e-6
+# Pixels, scene units or seconds: nothing real comes near, and sums and squares stay finite.
+_LARGEST = 1e9
 
 
 class _MetaFile(BaseModel):
@@ -65,6 +67,10 @@ class SplitFile:
                 if name.split("/")[0] != self.names[c]:
                     raise SplashbenchError(f"{path}: fn changes the order of cameras at frame {t}; keep one order")
                 self.paths[self.names[c]].append(name)
+        for names in self.paths.values():
+            if len(set(names)) != n_frames:
+                twice = next(name for name in names if names.count(name) > 1)
+                raise SplashbenchError(f"{path}: fn names {twice} in two frames; mend the entry")
         self.K, self.w2c, self.size, self.n_frames = intrinsics, w2c, (meta.w, meta.h), n_frames
 
 
@@ -80,8 +86,10 @@ def _static(path: Path, key: str, values: list, shape: tuple[int, ...]) -> NDArr
     if array.shape != shape:
         found = "x".join(map(str, array.shape))
         raise SplashbenchError(f"{path}: {key} is {found}; it must be {wanted} (frames, cameras, rows, columns)")
-    if not np.isfinite(array).all():
-        raise SplashbenchError(f"{path}: {key} has entries that are not finite; write the calibration again")
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
+        raise SplashbenchError(
+            f"{path}: {key} has entries that are not finite or beyond {_LARGEST:g}; write the calibration again"
+        )
     scale = max(1.0, float(np.abs(array[0]).max(initial=0.0)))
     if np.abs(array - array[0]).max(initial=0.0) > _STATIC_TOLERANCE * scale:
         raise SplashbenchError(f"{path}: {key} changes between frames; moving cameras are not supported")
@@ -114,17 +122,20 @@ class SceneMeta(BaseModel):
             _check_times("times", self.times)
         for camera, times in (self.camera_times or {}).items():
             _check_times(f"camera_times of camera {camera}", times)
-        if self.gravity is not None and abs(float(np.linalg.norm(self.gravity)) - 1) > 1e-3:
+        if self.gravity is not None and not abs(float(np.linalg.norm(self.gravity)) - 1) <= 1e-3:
             raise ValueError("gravity must be a unit vector")
-        if self.container_pose is not None and np.shape(self.container_pose) != (4, 4):
-            raise ValueError("container_pose must be 4x4")
+        if self.container_pose is not None:
+            if [len(row) for row in self.container_pose] != [4] * 4:
+                raise ValueError("container_pose must be 4x4")
+            if not np.isfinite(self.container_pose).all():
+                raise ValueError("container_pose must be finite")
         for camera, (width, height) in (self.sizes or {}).items():
-            if not (0 < width <= 65536 and 0 < height <= 65536):
+            if not (0 < width <= 65536 and 0 < height <= 65536 and width * height <= MAX_PIXELS):
                 raise ValueError(f"sizes: camera {camera} has {width}x{height} pixels")
         return self
 
 
 def _check_times(what: str, times: list[float]) -> None:
     array = np.asarray(times, dtype=np.float64)
-    if not np.isfinite(array).all() or (np.diff(array) <= 0).any():
+    if not (np.abs(array) <= _LARGEST).all() or (np.diff(array) <= 0).any():
         raise ValueError(f"{what} must be finite and strictly increasing")

@@ -59,6 +59,12 @@ class Particles:
         """Read what `save` wrote, or a stranger's file of that layout; one-line errors name the file."""
         arrays = read_npz(path, {"positions": 3, "active": 2}, optional={"velocities": 3})
         try:
-            return cls(arrays["positions"], arrays["active"], arrays.get("velocities"))
+            with np.errstate(over="ignore"):
+                particles = cls(arrays["positions"], arrays["active"], arrays.get("velocities"))
+            for name in ("positions", "velocities"):
+                values = getattr(particles, name)
+                if values is not None and not np.isfinite(values).all():
+                    raise ValueError(f"{name} has entries beyond the range of float32")
+            return particles
         except ValueError as error:
             raise SplashbenchError(f"{path}: {error}; write it again") from None

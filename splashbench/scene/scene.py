@@ -78,7 +78,7 @@ class Scene:
             if not (directory / name).is_file():
                 raise SplashbenchError(f"{directory / name} is missing; a scene has train_meta.json and test_meta.json")
         meta_path = directory / "scene.json"
-        meta = read_model(meta_path, SceneMeta) if meta_path.is_file() else None
+        meta = read_model(meta_path, SceneMeta) if meta_path.exists() or meta_path.is_symlink() else None
         return cls(directory, SplitFile(directory / "train_meta.json"), SplitFile(directory / "test_meta.json"), meta)
 
     def _size(self, camera: str) -> tuple[int, int]:
@@ -102,6 +102,13 @@ class Scene:
             self.times = np.arange(self.n_frames, dtype=np.float64) * NOMINAL_STEP_SECONDS
             self.times_source = "nominal"
         own = (self.meta.camera_times if self.meta else None) or {}
+        for key, known in (("camera_times", own), ("sizes", (self.meta.sizes if self.meta else None) or {})):
+            unknown = sorted(set(known) - set(self.cameras))
+            if unknown:
+                raise SplashbenchError(
+                    f"{self.directory / 'scene.json'}: {key} names camera {unknown[0]}, which the scene does not have; "
+                    "mend the entry"
+                )
         self.camera_times = {
             name: self._checked_times(f"camera_times of {name}", own[name]) if name in own else self.times
             for name in self.cameras
@@ -148,7 +155,7 @@ class Scene:
     def initial_points(self) -> NDArray[np.float32] | None:
         """Static points [N, 7] as x, y, z (scene units), r, g, b in [0, 1], segment; None where there are none."""
         path = self.directory / "init_pt_cld.npz"
-        if not path.is_file():
+        if not path.exists():
             return None
         data = read_npz(path, {"data": 2})["data"]
         if data.shape[1] < 6:
@@ -185,6 +192,8 @@ class Scene:
                 raise SplashbenchError(f"{path} is missing; restore it, or leave its frame out of the *_meta.json")
             entry = [path.relative_to(self.directory).as_posix(), sha256_file(path)]
             digest.update(json.dumps(entry).encode())
+        # Without scene.json the folder's name decides both of these (Table S1), and both move the metrics.
+        digest.update(json.dumps([self.times.tolist(), self.is_released]).encode())
         return digest.hexdigest()
 
     def training(self) -> TrainingScene:

@@ -26,6 +26,7 @@ from splashbench.score.views import Track, score_views
 from splashbench.version import __version__
 
 REFERENCE_METHOD = "nothing"
+MIN_TIMED_FRAMES = 100
 _OK = "ok"
 
 
@@ -132,12 +133,17 @@ def _require_reference(scene: Scene, reference: Any) -> None:
 
 
 def _costs(record: Any) -> dict[str, MetricValue]:
-    """What the harness measured; the method has no say in it."""
-    return {
+    """What the harness measured; the method has no say in it. A frame rate from few frames is none."""
+    costs = {
         name: metric_value(name, _number(getattr(record, name)), "not measured")
         for name, metric in METRICS.items()
         if metric.group == "cost"
     }
+    timed = getattr(record, "timed_frames", None)
+    if timed is not None and timed < MIN_TIMED_FRAMES:
+        few = f"only {timed} frames were timed, not {MIN_TIMED_FRAMES}"
+        costs["render_fps"] = metric_value("render_fps", None, few)
+    return costs
 
 
 def _number(value: float | None) -> float | None:

@@ -85,7 +85,10 @@ def _score_frame(
     row["spill"] = spill(alpha, mask)
     masked_render = outside_filled(render, truth, mask, protocol.outside_mask)
     masked_truth = outside_filled(truth, truth, mask, protocol.outside_mask)
-    row["ssim"], row["ssim_fg"] = ssim(masked_render, masked_truth, mask, protocol.ssim_sigma)
+    try:
+        row["ssim"], row["ssim_fg"] = ssim(masked_render, masked_truth, mask, protocol.ssim_sigma)
+    except ValueError as error:
+        raise SplashbenchError(f"{scene.image_path(name, t)}: {error}; such a view cannot be scored") from None
     if lpips is not None:
         row["lpips"] = lpips(masked_render, masked_truth)
     if reference is not None:

@@ -1,15 +1,25 @@
 """Submissions: what a method hands in. Writing, reading and checking them."""
 
 from splashbench.submission.identity import PROTOCOL, Identity, Record, Status
-from splashbench.submission.submission import Submission, check_submission, seal, to_8bit, write_view
+from splashbench.submission.submission import (
+    IDENTITY,
+    Submission,
+    check_submission,
+    identity_text,
+    seal,
+    to_8bit,
+    write_view,
+)
 
 __all__ = [
+    "IDENTITY",
     "PROTOCOL",
     "Identity",
     "Record",
     "Status",
     "Submission",
     "check_submission",
+    "identity_text",
     "seal",
     "to_8bit",
     "write_view",

@@ -11,6 +11,10 @@ PROTOCOL: Literal["v1"] = "v1"
 _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 
 
+#: No cost of a run comes near; anything beyond is no measurement (and infinity is none either).
+_MOST = 10**15
+
+
 class Status(str, Enum):
     """How a run ended. Only `ok` is scored; everything else is kept, shown and never dropped."""
 
@@ -20,6 +24,7 @@ class Status(str, Enum):
     TIMEOUT = "timeout"
     OUT_OF_MEMORY = "out_of_memory"
     NOT_FINITE = "not_finite"
+    OUT_OF_RANGE = "out_of_range"
     WRONG_SIZE = "wrong_size"
     INCOMPLETE = "incomplete"
 
@@ -35,6 +40,7 @@ class Identity(BaseModel):
     preset: str = "best"
     settings: dict[str, Any] = Field(default_factory=dict)
     seed: int = 0
+    device: str = "cpu"
     scene: str
     scene_digest: str = Field(pattern=r"^[0-9a-f]{64}$")
     control: bool = False
@@ -52,12 +58,13 @@ class Record(BaseModel):
     schema_version: Literal[1] = 1
     status: Status = Status.OK
     reason: str = ""
-    fit_seconds: float | None = Field(default=None, ge=0)
-    render_fps: float | None = Field(default=None, ge=0)
-    peak_memory_bytes: int | None = Field(default=None, ge=0)
-    peak_device_memory_bytes: int | None = Field(default=None, ge=0)
-    storage_bytes: int | None = Field(default=None, ge=0)
-    dynamic_bytes: int | None = Field(default=None, ge=0)
-    primitives_per_frame: float | None = Field(default=None, ge=0)
-    carriers_per_frame: float | None = Field(default=None, ge=0)
+    fit_seconds: float | None = Field(default=None, ge=0, le=_MOST)
+    render_fps: float | None = Field(default=None, ge=0, le=_MOST)
+    timed_frames: int | None = Field(default=None, ge=0)
+    peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MOST)
+    peak_device_memory_bytes: int | None = Field(default=None, ge=0, le=_MOST)
+    storage_bytes: int | None = Field(default=None, ge=0, le=_MOST)
+    dynamic_bytes: int | None = Field(default=None, ge=0, le=_MOST)
+    primitives_per_frame: float | None = Field(default=None, ge=0, le=_MOST)
+    carriers_per_frame: float | None = Field(default=None, ge=0, le=_MOST)
     log_tail: list[str] = Field(default_factory=list)

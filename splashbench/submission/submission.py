@@ -32,6 +32,7 @@ from splashbench.files import (
 from splashbench.scene import Particles, Scene
 from splashbench.submission.identity import Identity, Record, Status
 
+IDENTITY = "submission.toml"
 SUMS = "SHA256SUMS"
 _MAX_FILES = 200_000
 
@@ -55,10 +56,15 @@ def write_view(directory: Path, camera: str, t: int, rgb: NDArray[np.uint8], alp
 def seal(directory: Path, identity: Identity, record: Record) -> None:
     """Write identity, record and, last, the digests of everything in `directory`."""
     directory = Path(directory)
-    write_text(directory / "submission.toml", toml.dumps(identity.model_dump(mode="json", exclude_none=True)))
+    write_text(directory / IDENTITY, identity_text(identity))
     write_model(directory / "record.json", record)
     lines = [f"{sha256_file(directory / name)}  {name}\n" for name in _files(directory)]
     write_text(directory / SUMS, "".join(lines))
+
+
+def identity_text(identity: Identity) -> str:
+    """submission.toml of `identity`. Raises TypeError where its settings hold what TOML cannot say."""
+    return toml.dumps(identity.model_dump(mode="json", exclude_none=True))
 
 
 def _files(directory: Path) -> list[str]:
@@ -86,14 +92,14 @@ class Submission:
     def open(cls, directory: Path, verify: bool = True) -> Submission:
         """Read the submission in `directory`; with `verify`, refuse it when a file was changed, added or removed."""
         directory = Path(directory)
-        if not (directory / "submission.toml").is_file():
-            raise SplashbenchError(f"{directory} is no submission (no submission.toml in it); give a run's folder")
+        if not (directory / IDENTITY).is_file():
+            raise SplashbenchError(f"{directory} is no submission (no {IDENTITY} in it); give a run's folder")
         if verify:
             faults = integrity_faults(directory)
             if faults:
                 more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
                 raise SplashbenchError(f"{faults[0]}{more}; the submission is refused: run the method again")
-        path = directory / "submission.toml"
+        path = directory / IDENTITY
         identity = validate_model(path, Identity, toml.load(path))
         return cls(directory, identity, read_model(directory / "record.json", Record))
 

@@ -46,7 +46,7 @@ def write_balls_scene(
         gravity=(0.0, -1.0, 0.0),
         provenance={"made_by": "splashbench.synth.balls", "seed": seed},
     )
-    with atomic_directory(Path(directory), replace=replace) as staging:
+    with atomic_directory(Path(directory), replace=replace, holds="train_meta.json") as staging:
         write_scene(
             staging,
             cameras=cameras,

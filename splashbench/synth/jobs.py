@@ -5,6 +5,7 @@ Every job seeds its own random numbers from the session's seed, so the result do
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.files import write_png
+from splashbench.processes import end_with_parent
 from splashbench.synth import plan as planned
 from splashbench.synth.audio import SAMPLE_RATE, record, room_noise
 from splashbench.synth.clip import board_images, board_poses
@@ -33,9 +35,11 @@ _SWEEP_SAMPLES = 2
 
 
 def prepare_worker() -> None:
-    """Keep a worker to one core: the workers together fill the machine."""
+    """Keep a worker to one core, as the workers together fill the machine, and let it end with its parent."""
     import cv2
 
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of them; the parent alone answers
     cv2.setNumThreads(1)
 
 

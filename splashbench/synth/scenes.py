@@ -71,7 +71,8 @@ def make_scene(
     if timesteps < 2:
         raise SplashbenchError(f"--timesteps {timesteps} will not do; give 2 or more")
     recipe = RECIPES[name]
-    options = Options(size=size, seed=seed, particle_radius=particle_radius or recipe.pour.particle_radius)
+    radius = recipe.pour.particle_radius if particle_radius is None else particle_radius
+    options = Options(size=size, seed=seed, particle_radius=radius)
     plan = make_plan(options)
     pour = replace(
         recipe.pour,
@@ -81,7 +82,7 @@ def make_scene(
     lenses = {camera: _pinhole(plan.recorders[camera].camera) for camera in CAMERAS}
     shown = np.linspace(*recipe.shown, timesteps)
     with (
-        atomic_directory(Path(out), replace=replace_existing) as staging,
+        atomic_directory(Path(out), replace=replace_existing, holds="train_meta.json") as staging,
         tempfile.TemporaryDirectory(prefix="splashbench-") as scratch,
     ):
         running = simulation.start(pour, bowl_mesh(), Path(scratch))

@@ -40,7 +40,7 @@ def make_session(out: Path, options: Options, replace: bool = False, workers: in
     """
     plan = make_plan(options)
     with (
-        atomic_directory(Path(out), replace=replace) as directory,
+        atomic_directory(Path(out), replace=replace, holds="truth/truth.json") as directory,
         tempfile.TemporaryDirectory(prefix="splashbench-") as scratch,
     ):
         running = simulation.start(plan.pour, bowl_mesh(), Path(scratch))
@@ -76,6 +76,9 @@ def _gather(futures: list[Future[Any]], description: str) -> None:
     except BaseException:
         for future in futures:
             future.cancel()
+        # Leaving the pool would wait for what is under way, which takes minutes.
+        for process in multiprocessing.active_children():
+            process.terminate()
         raise
 
 

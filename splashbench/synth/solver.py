@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from splashbench.processes import end_with_parent
+
 # The wheel segfaults at import unless the system's libGL is in the process already.
 PRELOADED_LIBRARIES = ("libGL.so.1", "libX11.so.6")
 TABLE_HEIGHT = 0.0025  # metres: of the centres of particles that lie on the table
@@ -25,6 +27,7 @@ def main(scene_file: str, output: str, step_seconds: float) -> int:
     """Run the scene; write times [S], counts [S] and all snapshots' ids, positions and velocities, concatenated."""
     progress = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # the solver logs to standard output, which here belongs to the progress lines
+    end_with_parent()
     for library in PRELOADED_LIBRARIES:
         ctypes.CDLL(library)
     import pysplishsplash as sph

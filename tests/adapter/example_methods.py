@@ -141,3 +141,18 @@ class Peek(Good):
         assert sorted(path.name for path in (scene.directory / "seg").iterdir()) == list(scene.train)
         assert not (scene.directory / "truth").exists()
         return super().fit(scene, config, run)
+
+
+class Integers(Good):
+    """Renders 0 to 255, the commonest mistake."""
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        fitted = super().load(directory, scene)
+        original = fitted.render
+
+        def render(camera: Camera, time: float) -> Render:
+            result = original(camera, time)
+            return Render(result.rgb * 255, result.alpha)
+
+        fitted.render = render  # type: ignore[method-assign]
+        return fitted

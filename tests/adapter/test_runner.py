@@ -1,6 +1,7 @@
 """The harness: whatever a method does, there is a submission with a status, and never a half-written one."""
 
 import os
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ def test_a_good_method_is_measured_and_whole(balls_directory: Path, balls: Scene
         ("OutOfMemory", Status.OUT_OF_MEMORY, "10 TiB"),
         ("NotFinite", Status.NOT_FINITE, "camera 6, timestep 3: the render has NaN"),
         ("WrongSize", Status.WRONG_SIZE, r"rgb is \(32, 48, 3\)"),
+        ("Integers", Status.OUT_OF_RANGE, r"rgb is float32 from 0 to 63.75, not floats in \[0, 1\]"),
         ("TooFewFrames", Status.INCOMPLETE, "not a Render"),
     ],
 )
@@ -67,22 +69,26 @@ def test_a_failing_method_gets_a_status_and_a_reason(
     assert check_submission(tmp_path / "out") == []
 
 
-def test_a_hanging_method_is_stopped_with_all_its_processes(balls_directory: Path, tmp_path: Path) -> None:
+def test_a_hanging_method_is_stopped_with_all_its_processes(
+    balls_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Every process the run starts inherits this mark, also one that its parent has left behind.
+    mark = uuid.uuid4().hex
+    monkeypatch.setenv("SPLASHBENCH_TEST_MARK", mark)
     submission = _run("Hang", balls_directory, tmp_path / "out", timeout_seconds=4)
     assert submission.status == Status.TIMEOUT
     assert "over 4 s" in submission.reason
     left = [
-        entry
+        entry.name
         for entry in Path("/proc").iterdir()
-        if entry.name.isdigit() and b"splashbench.adapter.child" in _command_line(entry)
+        if entry.name.isdigit() and int(entry.name) != os.getpid() and mark.encode() in _environment(entry)
     ]
     assert left == []
 
 
-def _command_line(process: Path) -> bytes:
+def _environment(process: Path) -> bytes:
     try:
-        # A killed process that nobody has waited for yet has an empty command line.
-        return (process / "cmdline").read_bytes() if os.access(process / "cmdline", os.R_OK) else b""
+        return (process / "environ").read_bytes()
     except OSError:
         return b""
 
@@ -106,6 +112,10 @@ def test_wrong_names_and_settings_are_told_before_anything_runs(balls_directory:
         _run("Best", balls_directory, tmp_path / "out")
     with pytest.raises(SplashbenchError, match="no preset 'fast'; choose one of best, blue"):
         _run("Good", balls_directory, tmp_path / "out", preset="fast")
+    with pytest.raises(SplashbenchError, match="method good runs on cpu, not on 'banana'"):
+        _run("Good", balls_directory, tmp_path / "out", device="banana")
+    with pytest.raises(SplashbenchError, match="the oracle is the truth itself"):
+        run_method("oracle", balls_directory, tmp_path / "out", preset="quick")
     with pytest.raises(SplashbenchError, match="this method's settings: blue"):
         _run("Good", balls_directory, tmp_path / "out", overrides={"green": 1})
     assert list(tmp_path.iterdir()) == []

@@ -133,6 +133,16 @@ def test_stretch_is_clamped_without_turning():
     np.testing.assert_allclose(clamp_stretch(kept), kept, atol=1e-6)
 
 
+def test_stretch_is_clamped_wherever_a_singular_value_leaves_the_bounds():
+    rng = np.random.default_rng(0)
+    deformation = (np.eye(3) + rng.uniform(0, 1.2, (4000, 1, 1)) * rng.normal(size=(4000, 3, 3))).astype(np.float32)
+    left, stretch, right = np.linalg.svd(deformation.astype(np.float64))
+    assert 0.2 < ((stretch > 3) | (stretch < 1 / 3)).any(axis=1).mean() < 0.8
+    expected = (left * np.clip(stretch, 1 / 3, 3)[:, None]) @ right
+    np.testing.assert_allclose(clamp_stretch(deformation), expected, atol=2e-5)
+    assert clamp_stretch(deformation[:0]).shape == (0, 3, 3)
+
+
 def test_correction_moves_exterior_carriers_only_and_no_farther_than_its_limit():
     phi = ball((20, 20, 20))
     inside, near, far = [20.0, 20, 15], [28.5, 20, 20], [20.0, 33, 20]

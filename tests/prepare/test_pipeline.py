@@ -172,6 +172,9 @@ def test_an_existing_scene_is_kept_unless_told_otherwise(session: Path) -> None:
     (scene / "notes.txt").write_text("mine")
     with pytest.raises(SplashbenchError, match="exists already"):
         prepare(session, scene)
+    with pytest.raises(SplashbenchError, match="no earlier output"):
+        prepare(session, scene, Options(replace=True))
+    (scene / "train_meta.json").touch()
     with pytest.raises(SplashbenchError, match="ChArUco"):
         prepare(session, scene, Options(replace=True))
     assert (scene / "notes.txt").read_text() == "mine"
@@ -182,7 +185,7 @@ def test_command_line_exit_statuses(session: Path, capsys: pytest.CaptureFixture
     assert main(["prepare", str(session), scene]) == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith("error: ")
     assert main(["prepare", str(session), scene, "--interval", "3", "2"]) == 1
-    assert "START must come before END" in capsys.readouterr().err
+    assert "START before END" in capsys.readouterr().err
     for wrong in (["--timesteps", "1"], ["--interval", "1"], ["--image-format", "bmp"]):
         with pytest.raises(SystemExit) as caught:
             main(["prepare", str(session), scene, *wrong])

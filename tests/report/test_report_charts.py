@@ -63,6 +63,14 @@ def test_without_lpips_weights_the_panel_shows_miou(make_result: Any) -> None:
     assert machine.perceptual_name() == "lpips"
 
 
+def test_two_protocols_never_share_a_panel(make_result: Any) -> None:
+    first = make_result("alpha", 0, psnr=20.0, fit_seconds=5.0)
+    changed = first.model_copy(update={"protocol": first.protocol.model_copy(update={"opacity_threshold": 0.9})})
+    found = machines([Source("0.json", first), Source("1.json", changed)])
+    assert [len(machine.entries[0].dots) for machine in found] == [1, 1]
+    assert found[0].title.endswith("protocol v1")
+
+
 def test_presets_and_settings_of_a_method_are_told_apart(make_result: Any) -> None:
     results = [
         make_result("alpha", 0, psnr=20.0, fit_seconds=5.0),

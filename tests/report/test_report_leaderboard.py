@@ -110,6 +110,21 @@ def test_the_better_informed_of_two_scores_of_one_submission_stands(tmp_path: Pa
     assert [source.path.split("/")[0] for source in sources] == ["with"]
 
 
+def test_an_old_and_a_new_run_are_no_spread_over_seeds(tmp_path: Path, make_result: Any) -> None:
+    old = make_result("alpha", 0, psnr=20.0)
+    new = old.model_copy(update={"digests": old.digests.model_copy(update={"submission": "f" * 64})})
+    for result in (old, new):
+        result.save(tmp_path)
+    with pytest.raises(SplashbenchError, match="two runs of alpha with one seed and the same settings"):
+        load_results(tmp_path)
+
+
+def test_a_submission_given_for_results_is_told(tmp_path: Path) -> None:
+    (tmp_path / "submission.toml").touch()
+    with pytest.raises(SplashbenchError, match="is a submission, not results; score it first"):
+        load_results(tmp_path)
+
+
 def test_sources_and_claims_are_listed(make_result: Any) -> None:
     result = make_result("alpha", psnr=20.0, claimed={"psnr": 35.0})
     row = Row((result,))

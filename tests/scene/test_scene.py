@@ -135,6 +135,12 @@ def test_the_digest_covers_every_pixel_and_no_truth(balls_copy: Path) -> None:
     assert Scene.open(balls_copy).digest != before
 
 
+def test_the_digest_covers_what_a_released_name_decides(balls_copy: Path) -> None:
+    (balls_copy / "scene.json").unlink()
+    before = Scene.open(balls_copy).digest
+    assert Scene.open(balls_copy.rename(balls_copy.with_name("bowl_004"))).digest != before
+
+
 def test_a_missing_scene_is_told(tmp_path: Path) -> None:
     with pytest.raises(SplashbenchError, match="is not a folder"):
         Scene.open(tmp_path / "nowhere")
