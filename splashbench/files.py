@@ -100,6 +100,7 @@ def atomic_directory(
     """
     path = Path(path).resolve()  # a link stays and its target is replaced
     _require_replaceable(path, replace, holds, inputs)
+    require_folder_place(path.parent if path.exists() else path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(path)
     retired = _sibling(path)

@@ -61,12 +61,13 @@ def main(argv: list[str] | None = None) -> int:
         with terminable():
             arguments = build_parser().parse_args(argv)
             status = int(arguments.handler(arguments))
-            sys.stdout.flush()
+            _flush()
             return status
     except SplashbenchError as error:
         return _fail(str(error))
     except KeyboardInterrupt as error:
-        print("\ninterrupted; nothing half-written was left", file=sys.stderr)
+        with suppress(BrokenPipeError):
+            print("\ninterrupted; nothing half-written was left", file=sys.stderr)
         return 128 + (error.signum if isinstance(error, Terminated) else signal.SIGINT)
     except BrokenPipeError:
         # The reader of our output went away (`| head`): the status that a shell gives to any tool then.
@@ -77,13 +78,19 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         from splashbench.files import as_asked
 
-        name = "a file" if error.filename is None else as_asked(os.fsdecode(error.filename))
-        try:
-            sys.stdout.flush()
-        except OSError:
-            _drop_output()
-            name = "standard output"
+        name = "standard output or a file" if error.filename is None else as_asked(os.fsdecode(error.filename))
         return _fail(f"{name}: {error.strerror or error}; check the path, its permissions and the space on the disk")
+
+
+def _flush() -> None:
+    """Write what standard output still holds; a failure names it."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _drop_output()
+        raise OSError(error.errno, error.strerror, "standard output") from None
 
 
 def _drop_output() -> None:
