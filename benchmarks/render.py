@@ -1,95 +1,412 @@
-"""How fast the renderer is: forward and backward milliseconds on scenes like a training view of liquid.
+"""How fast the renderer is, and how exact: the figures that it promises, measured side by side in one run.
 
-    python benchmarks/render.py [--repeats 15] [--json]
+    python benchmarks/render.py [--prototype DIR] [--json FILE] [--repeats N] [--quick]
 
-A bumpy shell of flat Gaussians covers a quarter of the image, about 25 of them contributing to each covered pixel.
-The scenes are named as in the measurements that set the target: 20 ms for both passes of `i` on two threads.
+A time is that of one forward and backward pass through torch's autograd, on two threads and for fixed random gradients
+of both images. What is compared takes turns (A B A B ...), after two rounds that do not count. A ratio is the median
+over the rounds of A's time over B's in the same round, so that a slow spell of a shared machine hits both. The JSON has
+
+prototype_ratio     ours / the C++ prototype in DIR, which is compiled here and now, on scenes iii, i and ii. The
+                    prototype takes covariances, made outside the clock.
+torch_ratio         tests/render/reference.py (plain torch, float32) / ours on scene i. The reference runs once on one
+                    torch thread and once on two; the faster run counts.
+thread_scaling      one thread / two threads, scene i.
+mask_speedup        all tiles / those that a centered disc of 20% of the pixels touches, the others skipped. The scene:
+                    85 000 Gaussians all over 1200x1800. The table also has it for compact output.
+frozen_ratio        scene ii before, in and behind a frozen background (those 85 000 Gaussians, with which it
+                    interleaves in depth) / all 170 000 with gradients. `frozen_identical` says whether the images are
+                    the same bit for bit.
+gradient_error      the largest relative L2 error among the gradients of means, factors, opacities and colors on scenes
+                    iii and i, against the reference in float64. The loss reads no pixel where rounding may decide what
+                    is drawn (`threshold_pixels` there).
+exponent_gaussians  slope of log time over log N for N = 5000 to 160 000 at 640x416. Gaussians shrink as N grows: about
+                    25 always contribute to a covered pixel.
+exponent_pixels     slope of log time over log pixels: scene iii unchanged, in images from 240x160 to 1920x1280.
+
+(slopes by least squares through the medians), and beside them `medians_ms`, `machine`, `kernel`, `repeats`, `missing`
+(what was not measured, and why).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import importlib.util
+import math
+import shutil
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
-from splashbench.parallel import thread_count
-from splashbench.render import cpu
+from splashbench.adapter import hardware
+from splashbench.files import write_json
+from splashbench.render import cpu, freeze, native, rasterize, tile_modes, to_tiles
 from splashbench.scene import Camera
 
-SCENES = {"iii": (5_000, 240, 160), "i": (20_000, 640, 416)}
-COVERED, OVERLAP, DISTANCE = 0.25, 25.0, 4.0
+SCENES = {"iii": (5_000, 240, 160), "i": (20_000, 640, 416), "ii": (85_000, 1200, 1800)}
+COVERED, OVERLAP, DISTANCE, TURN = 0.25, 25.0, 4.0, 0.3
+CROP_COVERED = 0.9
+BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
+MASKED = 0.2
+COUNTS = (5_000, 10_000, 20_000, 40_000, 80_000, 160_000)
+SCALES = (1, 2, 4, 8)
+THREADS = 2
+WARM_UP = 2
+
+# The prototype's build line, as its README has it.
+COMPILE = [
+    "g++", "-O3", "-std=c++17", "-fno-math-errno", "-fno-trapping-math", "-freciprocal-math", "-fno-signed-zeros",
+    "-ffp-contract=fast", "-march=native", "-shared", "-fPIC", "-pthread", "-DVW=8", "-DAABB", "-DTW=64", "-DTH=32",
+]  # fmt: skip
+
+TARGETS = {
+    "prototype_ratio iii": "<= 1.15",
+    "prototype_ratio i": "<= 1.15",
+    "prototype_ratio ii": "<= 1.15",
+    "torch_ratio": ">= 300",
+    "thread_scaling": ">= 1.7",
+    "mask_speedup": ">= 3.5",
+    "frozen_ratio": "<= 0.6",
+    "gradient_error": "<= 2e-5",
+    "exponent_gaussians": "<= 1.1",
+    "exponent_pixels": "<= 1.1",
+}
+
+Pass = Callable[[], Any]
 
 
-def make_scene(n: int, width: int, height: int, seed: int = 0) -> tuple[list[NDArray], Camera]:
-    """N Gaussians as [means, covariances, opacities, colors] (float32), and the camera that looks at them."""
+class Gaussians(NamedTuple):
+    """Gaussians as `rasterize` takes them, float32."""
+
+    means: torch.Tensor
+    factors: torch.Tensor
+    opacities: torch.Tensor
+    colors: torch.Tensor
+
+
+class Scene(NamedTuple):
+    """Gaussians, and the camera that looks at them."""
+
+    gaussians: Gaussians
+    camera: Camera
+
+
+def make_scene(n: int, width: int, height: int, seed: int = 0, covered: float = COVERED) -> Scene:
+    """N flat Gaussians on a bumpy shell: about `covered` of the image, OVERLAP contributing to each covered pixel."""
     rng = np.random.default_rng(seed)
     focal = 1.4 * max(width, height)
-    radius_px = np.sqrt(COVERED * width * height / np.pi)
-    radius = radius_px * DISTANCE / focal / np.sqrt(1 + (radius_px / focal) ** 2)
+    radius_px = math.sqrt(covered * width * height / math.pi)
+    radius = radius_px * DISTANCE / focal / math.sqrt(1 + (radius_px / focal) ** 2)
     normal = rng.normal(size=(n, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    bumps = 1 + 0.06 * np.sin(15 * normal[:, :1]) * np.cos(8 * normal[:, 1:2])
-    means = normal * radius * bumps
+    bumps = 1 + 0.06 * np.sin(15 * normal[:, :1]) * np.cos(12 * normal[:, 1:2])
+    means = radius * (normal * bumps + 0.004 * rng.normal(size=(n, 3)))
     opacities = rng.uniform(0.3, 0.99, n)
     # A footprint is the ellipse alpha >= 1/255: area 2 pi ln(255 o) s1 s2, about halved by foreshortening.
-    footprint = COVERED * width * height * OVERLAP / n
-    variance = footprint * 1.75 / (np.pi * 2 * np.log(255 * opacities).mean()) - 0.3
-    size = np.sqrt(max(variance, 0.2)) * DISTANCE / focal
-    scales = size * np.exp(rng.normal(size=(n, 3)) * [0.45, 0.45, 0.3] - [0.1, 0.1, np.log(5.0)])
+    footprint = covered * width * height * OVERLAP / n
+    variance = footprint * 1.75 / (math.pi * 2 * np.log(255 * opacities).mean()) - 0.3
+    size = math.sqrt(max(variance, 0.2)) * DISTANCE / focal
+    scales = size * np.exp(rng.normal(size=(n, 3)) * [0.45, 0.45, 0.3] - [0.1, 0.1, math.log(5)])
     tangent = np.cross(normal, rng.normal(size=(n, 3)))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     factors = np.stack([tangent, np.cross(normal, tangent), normal], axis=2) * scales[:, None]
-    arrays = [means, factors @ factors.transpose(0, 2, 1), opacities, rng.uniform(size=(n, 3))]
-    w2c = np.eye(4)
-    w2c[2, 3] = DISTANCE
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return [array.astype(np.float32) for array in arrays], Camera("benchmark", width, height, K, w2c)
+    c, s = math.cos(TURN), math.sin(TURN)
+    w2c = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, DISTANCE], [0, 0, 0, 1]])
+    K = np.array([[focal, 0, width / 2 + 0.3], [0, focal, height / 2 - 0.2], [0, 0, 1]])
+    camera = Camera("benchmark", width, height, K, w2c)
+    colors = rng.uniform(size=(n, 3))
+    tensors = [torch.tensor(array, dtype=torch.float32) for array in (means, factors, opacities, colors)]
+    return Scene(Gaussians(*tensors), camera)
 
 
-def measure(name: str, repeats: int) -> dict[str, float | int | str]:
-    """Median milliseconds of the forward and of the backward pass, after one pass to compile."""
-    n, width, height = SCENES[name]
-    arrays, camera = make_scene(n, width, height)
-    weights = np.random.default_rng(1).normal(size=(height, width, 3)).astype(np.float32)
-    forward, backward = [], []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        rendering = cpu.forward(*arrays, camera)
-        middle = time.perf_counter()
-        cpu.backward(rendering, weights, weights[..., 0])
-        forward.append(1e3 * (middle - start))
-        backward.append(1e3 * (time.perf_counter() - middle))
-    return {
-        "scene": name,
-        "gaussians": n,
-        "width": width,
-        "height": height,
-        "threads": thread_count(),
-        "forward_ms": round(statistics.median(forward[1:]), 2),
-        "backward_ms": round(statistics.median(backward[1:]), 2),
-    }
+def crop_scene(seed: int = 1) -> Scene:
+    """As many Gaussians as in scene ii, and as many at each covered pixel, all over an image of its size."""
+    return make_scene(*SCENES["ii"], seed=seed, covered=CROP_COVERED)
+
+
+def image_gradients(camera: Camera) -> list[torch.Tensor]:
+    """Fixed gradients of the loss with respect to color and opacity."""
+    generator = torch.Generator().manual_seed(1)
+    shapes = (camera.height, camera.width, 3), (camera.height, camera.width)
+    return [torch.randn(shape, generator=generator) for shape in shapes]
+
+
+def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """Copies that ask for gradients."""
+    return Gaussians(*[tensor.to(dtype, copy=True).requires_grad_() for tensor in gaussians])
+
+
+def our_pass(
+    gaussians: Gaussians,
+    camera: Camera,
+    outer: list[torch.Tensor] | None = None,
+    threads: int = THREADS,
+    **options: Any,
+) -> Pass:
+    """One forward and backward pass of `rasterize`; outer: the gradients of the two images."""
+    inputs = leaves(gaussians)
+    outer = outer or image_gradients(camera)
+
+    def run() -> tuple[torch.Tensor, ...]:
+        with cpu.threads(threads):
+            images = rasterize(*inputs, camera, background=BACKGROUND, backend="cpu", **options)
+            return torch.autograd.grad(images, inputs, outer)
+
+    return run
+
+
+def take_turns(passes: dict[Any, Pass], repeats: int) -> dict[Any, list[float]]:
+    """Milliseconds of `repeats` calls of each pass, in turn: entry k of every list is of round k."""
+    times: dict[Any, list[float]] = {name: [] for name in passes}
+    for turn in range(WARM_UP + repeats):
+        for name, run in passes.items():
+            start = time.perf_counter()
+            run()
+            elapsed = 1e3 * (time.perf_counter() - start)
+            if turn >= WARM_UP:
+                times[name].append(elapsed)
+    return times
+
+
+def ratio(numerators: list[float], denominators: list[float]) -> float:
+    """Median over the rounds of one time over the other."""
+    return statistics.median(a / b for a, b in zip(numerators, denominators))
+
+
+def load_module(path: Path) -> ModuleType:
+    """The module in a file that is on no import path."""
+    spec = importlib.util.spec_from_file_location(f"benchmark_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no Python module")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def reference() -> ModuleType:
+    """The plain torch renderer of the tests."""
+    return load_module(Path(__file__).resolve().parents[1] / "tests" / "render" / "reference.py")
+
+
+class Benchmark:
+    """Measures one figure per method; `medians_ms` collects the medians behind them."""
+
+    def __init__(self, repeats: int, quick: bool, prototype: Path | None) -> None:
+        self.repeats, self.quick, self.prototype = repeats, quick, prototype
+        self.medians_ms: dict[str, float] = {}
+        self.missing: dict[str, str] = {}
+
+    def times(self, group: str, passes: dict[Any, Pass]) -> dict[Any, list[float]]:
+        """`take_turns`, whose medians are kept as "<group> <name>"."""
+        times = take_turns(passes, self.repeats)
+        self.medians_ms |= {f"{group} {name}": round(statistics.median(t), 3) for name, t in times.items()}
+        return times
+
+    def prototype_ratio(self) -> dict[str, float | None]:
+        """Scene -> our time over the prototype's; None where there is no prototype."""
+        nothing: dict[str, float | None] = dict.fromkeys(SCENES)
+        if self.prototype is None:
+            self.missing["prototype_ratio"] = "--prototype DIR was not given"
+            return nothing
+        if shutil.which("g++") is None:
+            self.missing["prototype_ratio"] = "no g++ on PATH to compile the prototype with"
+            return nothing
+        with tempfile.TemporaryDirectory() as folder:
+            library = Path(folder) / "libprototype.so"
+            done = subprocess.run(
+                [*COMPILE, str(self.prototype / "rast_port.cpp"), "-o", str(library)], capture_output=True, text=True
+            )
+            if done.returncode:
+                self.missing["prototype_ratio"] = f"the prototype did not compile: {done.stderr.strip()[-300:]}"
+                return nothing
+            module = load_module(self.prototype / "cpp_backend.py")
+            loaded = module.Lib(str(library.resolve()))
+            return {name: self._against(module, loaded, name) for name in SCENES}
+
+    def _against(self, module: ModuleType, library: Any, name: str) -> float:
+        scene = make_scene(*SCENES[name])
+        camera, outer = scene.camera, image_gradients(scene.camera)
+        factors = scene.gaussians.factors
+        covariances = factors @ factors.transpose(1, 2)
+        inputs = leaves(scene.gaussians._replace(factors=covariances))
+        w2c, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (camera.w2c, camera.K))
+
+        def prototype() -> tuple[torch.Tensor, ...]:
+            images = module.render(library, *inputs, w2c, K, camera.width, camera.height, bg=BACKGROUND, nthr=THREADS)
+            return torch.autograd.grad(images, inputs, outer)
+
+        ours = our_pass(scene.gaussians, camera, outer)
+        self._check_same_colors(name, ours()[3], prototype()[3])
+        times = self.times(f"scene {name}", {"ours": ours, "prototype": prototype})
+        return ratio(times["ours"], times["prototype"])
+
+    @staticmethod
+    def _check_same_colors(name: str, ours: torch.Tensor, theirs: torch.Tensor) -> None:
+        """A comparison of speeds means something only where the work is the same."""
+        difference = float((ours - theirs).norm() / theirs.norm())
+        if difference > 1e-2:
+            raise RuntimeError(f"scene {name}: the prototype's gradient of colors is {difference:.1e} away from ours")
+
+    def torch_ratio(self) -> float:
+        """The plain torch reference over ours."""
+        scene = make_scene(*SCENES["i"])
+        inputs, outer, rasterize_plainly = leaves(scene.gaussians), image_gradients(scene.camera), reference().rasterize
+        ours = our_pass(scene.gaussians, scene.camera, outer)
+        plain, fast = [], []
+        before = torch.get_num_threads()
+        for threads in (1, THREADS):
+            torch.set_num_threads(threads)
+            start = time.perf_counter()
+            images = rasterize_plainly(*inputs, scene.camera, background=BACKGROUND)
+            torch.autograd.grad(images, inputs, outer)
+            plain.append(1e3 * (time.perf_counter() - start))
+            torch.set_num_threads(before)
+            fast += take_turns({"ours": ours}, self.repeats)["ours"]
+        self.medians_ms |= {"plain torch": round(min(plain), 3), "plain torch ours": round(statistics.median(fast), 3)}
+        return min(plain) / statistics.median(fast)
+
+    def thread_scaling(self) -> float:
+        """One thread over two."""
+        scene = make_scene(*SCENES["i"])
+        passes: dict[Any, Pass] = {count: our_pass(scene.gaussians, scene.camera, threads=count) for count in (1, 2)}
+        times = self.times("scene i, threads", passes)
+        return ratio(times[1], times[2])
+
+    def mask_speedup(self) -> dict[str, float]:
+        """All tiles over those of the mask, for images and for compact output."""
+        scene = crop_scene()
+        width, height = scene.camera.width, scene.camera.height
+        rows, columns = np.mgrid[:height, :width] + 0.5
+        disc = (columns - width / 2) ** 2 + (rows - height / 2) ** 2 <= MASKED * width * height / math.pi
+        modes = tile_modes(disc)
+        outer = image_gradients(scene.camera)
+        tiled = [torch.from_numpy(to_tiles(image.numpy(), modes)) for image in outer]
+        passes = {
+            "all tiles": our_pass(scene.gaussians, scene.camera, outer),
+            "masked": our_pass(scene.gaussians, scene.camera, outer, modes=modes),
+            "masked, compact": our_pass(scene.gaussians, scene.camera, tiled, modes=modes, compact=True),
+        }
+        times = self.times("crop", passes)
+        return {name: ratio(times["all tiles"], times[name]) for name in ("masked", "masked, compact")}
+
+    def frozen(self) -> tuple[float, bool]:
+        """(frozen background over joint rendering, whether their images are identical)."""
+        scene, background = make_scene(*SCENES["ii"]), crop_scene()
+        camera = scene.camera
+        union = Gaussians(*[torch.cat(pair) for pair in zip(scene.gaussians, background.gaussians)])
+        frozen = freeze(*background.gaussians, camera)
+        joint = rasterize(*union, camera, background=BACKGROUND, backend="cpu")
+        merged = rasterize(*scene.gaussians, camera, background=BACKGROUND, backend="cpu", frozen=frozen)
+        identical = all(torch.equal(a, b) for a, b in zip(joint, merged))
+        passes = {"frozen": our_pass(scene.gaussians, camera, frozen=frozen), "joint": our_pass(union, camera)}
+        times = self.times("background", passes)
+        return ratio(times["frozen"], times["joint"]), identical
+
+    def gradient_error(self) -> float:
+        """The largest relative L2 error of a gradient."""
+        definition = reference()
+        worst = 0.0
+        for name in ("iii",) if self.quick else ("iii", "i"):
+            scene = make_scene(*SCENES[name])
+            smooth = ~definition.threshold_pixels(*scene.gaussians[:3], scene.camera)
+            outer = [
+                gradient * mask for gradient, mask in zip(image_gradients(scene.camera), (smooth[..., None], smooth))
+            ]
+            ours = our_pass(scene.gaussians, scene.camera, outer)()
+            inputs = leaves(scene.gaussians, torch.float64)
+            images = definition.rasterize(*inputs, scene.camera, background=BACKGROUND.double())
+            exact = torch.autograd.grad(images, inputs, [gradient.double() for gradient in outer])
+            errors = [float((a.double() - b).norm() / b.norm()) for a, b in zip(ours, exact)]
+            worst = max(worst, *errors)
+        return worst
+
+    def _exponent(self, group: str, passes: dict[int, Pass]) -> float:
+        medians = {size: statistics.median(times) for size, times in self.times(group, passes).items()}
+        return float(np.polyfit(np.log(list(medians)), np.log(list(medians.values())), 1)[0])
+
+    def exponent_gaussians(self) -> float:
+        """How time grows with N."""
+        scenes = {n: make_scene(n, *SCENES["i"][1:]) for n in COUNTS}
+        return self._exponent("gaussians", {n: our_pass(scene.gaussians, scene.camera) for n, scene in scenes.items()})
+
+    def exponent_pixels(self) -> float:
+        """How time grows with the number of pixels."""
+        scene = make_scene(*SCENES["iii"])
+        cameras = [scene.camera.scaled(scale) for scale in SCALES]
+        return self._exponent(
+            "pixels", {camera.width * camera.height: our_pass(scene.gaussians, camera) for camera in cameras}
+        )
+
+    def run(self) -> dict[str, Any]:
+        """Everything that the JSON holds."""
+        results: dict[str, Any] = {"prototype_ratio": self.prototype_ratio(), "torch_ratio": self.torch_ratio()}
+        results["thread_scaling"] = self.thread_scaling()
+        masks = self.mask_speedup()
+        results["mask_speedup"] = masks["masked"]
+        results["mask_speedup_compact"] = masks["masked, compact"]
+        results["frozen_ratio"], results["frozen_identical"] = self.frozen()
+        results["gradient_error"] = self.gradient_error()
+        results["exponent_gaussians"] = self.exponent_gaussians()
+        results["exponent_pixels"] = self.exponent_pixels()
+        return results | {
+            "medians_ms": self.medians_ms,
+            "machine": hardware.describe(),
+            "kernel": native.variant(),
+            "repeats": self.repeats,
+            "missing": self.missing,
+        }
+
+
+def print_table(results: dict[str, Any]) -> None:
+    """The figures with their targets, then the medians."""
+    machine = results["machine"]
+    print(f"{machine['cpu']}, {machine['cores']} cores, kernel {results['kernel']}, {results['repeats']} rounds\n")
+    print(f"{'figure':<24}{'measured':>10}  target")
+    for key in results:
+        if key == "medians_ms":
+            break
+        values = results[key] if isinstance(results[key], dict) else {"": results[key]}
+        for name, value in values.items():
+            label = f"{key} {name}".strip()
+            shown = "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+            print(f"{label:<24}{shown:>10}  {TARGETS.get(label, '')}".rstrip())
+    for key, reason in results["missing"].items():
+        print(f"{key} was not measured: {reason}")
+    print(f"\n{'forward + backward':<32}{'median ms':>10}")
+    for name, median in results["medians_ms"].items():
+        print(f"{name:<32}{median:>10.2f}")
 
 
 def main() -> int:
-    """Print a line, or a JSON object, per scene."""
+    """Print the table, and write the JSON where asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=15, help="timed passes per scene (default 15)")
-    parser.add_argument("--json", action="store_true", help="print one JSON list on standard output")
+    parser.add_argument("--prototype", type=Path, metavar="DIR", help="folder with the prototype's rast_port.cpp")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
+    parser.add_argument("--repeats", type=int, metavar="N", help="rounds that count (default 15; 5 with --quick)")
+    parser.add_argument("--quick", action="store_true", help="under a minute: fewer rounds, gradients on iii only")
     options = parser.parse_args()
-    rows = [measure(name, options.repeats) for name in SCENES]
-    if options.json:
-        print(json.dumps(rows))
-        return 0
-    for row in rows:
-        print(
-            f"{row['scene']:>4}: {row['gaussians']} Gaussians at {row['width']}x{row['height']}, "
-            f"{row['threads']} threads: forward {row['forward_ms']} ms, backward {row['backward_ms']} ms"
-        )
+    repeats = options.repeats if options.repeats is not None else 5 if options.quick else 15
+    if repeats < 1:
+        parser.error("--repeats must be at least 1")
+    for name in ("rast_port.cpp", "cpp_backend.py"):
+        if options.prototype is not None and not (options.prototype / name).is_file():
+            parser.error(f"--prototype {options.prototype}: there is no {name} in it")
+    if options.json is not None and not options.json.resolve().parent.is_dir():
+        parser.error(f"--json {options.json}: there is no such folder")
+    sys.dont_write_bytecode = True  # nothing is left in the prototype's folder
+    torch.set_num_threads(1)  # neither renderer uses torch's threads, which would take turns with their own
+    results = Benchmark(repeats, options.quick, options.prototype).run()
+    if options.json is not None:
+        write_json(options.json, results)
+    print_table(results)
     return 0
 
 

@@ -64,10 +64,10 @@ class Model(Fitted):
         t = int(np.abs(self.times - time).argmin())
         shown = self.active[t]
         n = int(shown.sum())
-        covariances = np.broadcast_to(np.eye(3, dtype=np.float32) * self.radius**2 / 4, (n, 3, 3))
+        factors = np.broadcast_to(np.eye(3, dtype=np.float32) * self.radius / 2, (n, 3, 3))  # of covariances B B^T
         opacities = np.full(n, 0.8, np.float32)
         points, colours = self.positions[t][shown], self.colours[t][shown]
-        return Render(*rasterize_arrays(points, covariances, opacities, colours, camera, background=self.background))
+        return Render(*rasterize_arrays(points, factors, opacities, colours, camera, background=self.background))
 
     def particles(self) -> Particles:
         # Points are drawn anew in every frame. Even and odd frames take rows of their own, so that no row claims to be

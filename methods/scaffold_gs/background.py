@@ -31,10 +31,10 @@ class Background:
         self.far_color = np.asarray(far_color, dtype=np.float32)
 
     def gaussians(self, camera: Camera) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Means [M, 3], covariances [M, 3, 3], opacities [M] and colors [M, 3] as seen from `camera`, float32."""
+        """Means [M, 3], factors [M, 3, 3], opacities [M] and colors [M, 3] as seen from `camera`, float32."""
         with torch.no_grad(), one_torch_thread():
-            means, covariances, opacities, colors, _ = self.model.decode(camera.center)
-        return means.numpy(), covariances.numpy(), opacities.numpy(), colors.numpy()
+            means, factors, opacities, colors, _ = self.model.decode(camera.center)
+        return means.numpy(), factors.numpy(), opacities.numpy(), colors.numpy()
 
     def render(self, camera: Camera) -> NDArray[np.float32]:
         """The liquid-free view of `camera`, float32 [H, W, 3] in [0, 1]."""

@@ -66,8 +66,8 @@ def fit_model(
             order = rng.permutation(len(plates)).tolist()
         view = order.pop()
         camera = plates[view].camera
-        means, covariances, opacities, colors, scales = model.decode(camera.center)
-        image, _ = rasterize(means, covariances, opacities, colors, camera, background=behind)
+        means, factors, opacities, colors, scales = model.decode(camera.center)
+        image, _ = rasterize(means, factors, opacities, colors, camera, background=behind)
         loss = (1 - _SSIM_WEIGHT) * l1(image, targets[view], weights[view])
         loss = loss + _VOLUME_WEIGHT * (scales / unit).prod(dim=1).mean()
         if iteration % settings.ssim_every == 0:
@@ -93,9 +93,9 @@ def supervised_anchors(model: AnchorModel, plates: list[Plate]) -> AnchorModel:
     for plate in plates:
         with torch.no_grad():
             drawn = torch.nonzero(model.opacities(plate.camera.center).reshape(-1) > 0)[:, 0]
-            means, covariances, opacities, colors, _ = model.decode(plate.camera.center)
+            means, factors, opacities, colors, _ = model.decode(plate.camera.center)
         color = torch.zeros_like(colors).requires_grad_()
-        image, _ = rasterize(means, covariances, opacities, color, plate.camera)
+        image, _ = rasterize(means, factors, opacities, color, plate.camera)
         image[..., 0][torch.as_tensor(plate.seen)].sum().backward()
         assert color.grad is not None
         weight.index_add_(0, drawn // k, color.grad[:, 0])

@@ -83,8 +83,8 @@ class AnchorModel(nn.Module):
         return torch.tanh(self.opacity_head(self._inputs(eye)[1]))
 
     def decode(self, eye: NDArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Gaussians as seen from `eye` [3]: means [M, 3], covariances [M, 3, 3], opacities [M], colors [M, 3], and
-        their scales [M, 3]. Children of non-positive opacity are left out, so M <= N K."""
+        """Gaussians as seen from `eye` [3]: means [M, 3], factors [M, 3, 3] (covariances B B^T), opacities [M], colors
+        [M, 3] and scales [M, 3]. Children of non-positive opacity are left out, so M <= N K."""
         n, k = len(self.positions), self.children_per_anchor
         seen, blind = self._inputs(eye)
         opacity = torch.tanh(self.opacity_head(blind)).reshape(-1)
@@ -96,7 +96,7 @@ class AnchorModel(nn.Module):
         base = self.features[:, None, :3]
         color = torch.sigmoid(self.color_head(seen).view(n, k, 3) + base).view(n * k, 3)[kept]
         means = self.positions[:, None] + self.offsets * torch.exp(self.log_scales[:, None, :3])
-        return means.view(n * k, 3)[kept], factor @ factor.transpose(1, 2), opacity[kept], color, scales
+        return means.view(n * k, 3)[kept], factor, opacity[kept], color, scales
 
 
 def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:

@@ -36,28 +36,21 @@ class DecoderSettings:
 class CarrierState:
     """What the decoder needs of n active carriers at one instant.
 
-    positions: [n, 3] scene units. deformation: [n, 3, 3], F. outer: [n, 9, 3], outer[:, 3 a + b, c] = F_ac F_bc. phi:
-    [n] transport voxels.
+    positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels.
     """
 
     positions: Tensor
     deformation: Tensor
-    outer: Tensor
     phi: Tensor
-
-    @classmethod
-    def of(cls, positions: Tensor, deformation: Tensor, phi: Tensor) -> CarrierState:
-        outer = (deformation[:, :, None, :] * deformation[:, None, :, :]).reshape(-1, 9, 3)
-        return cls(positions, deformation, outer, phi)
 
 
 @dataclass
 class Children:
-    """n carriers' K children: means [n, K, 3], covariances [n, K, 3, 3] (scene units), opacities [n, K], colours
-    [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units."""
+    """n carriers' K children: means [n, K, 3], factors [n, K, 3, 3] of their covariances B B^T (scene units), opacities
+    [n, K], colours [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units."""
 
     means: Tensor
-    covariances: Tensor
+    factors: Tensor
     opacities: Tensor
     colours: Tensor
     offsets: Tensor
@@ -100,17 +93,17 @@ class Decoder(nn.Module):
         offsets = self.offsets(features)
         local = (base[:, None] * offsets).transpose(1, 2)  # diag(s) o, [n, 3, K]
         means = state.positions[:, None] + torch.bmm(state.deformation, local).transpose(1, 2)
-        # Sigma = B B^T with B = F diag(g) / sqrt(K), so Sigma_ab = sum_c F_ac F_bc g_c^2 / K. The residual is bounded:
-        # an unbounded exponent lets single Gaussians grow over the whole image.
+        # Sigma = B B^T with B = F diag(g) / sqrt(K). The residual is bounded: an unbounded exponent lets single
+        # Gaussians grow over the whole image.
         residual = 2 * torch.tanh(0.5 * self.scale(features).view(n, k, 3))
-        variance = (base[:, None] * torch.exp(s.scale_range * residual)) ** 2 / k
-        covariances = torch.bmm(state.outer, variance.transpose(1, 2)).transpose(1, 2).reshape(n, k, 3, 3)
+        extent = base[:, None] * torch.exp(s.scale_range * residual) / math.sqrt(k)
+        factors = state.deformation[:, None] * extent[:, :, None, :]
         fade = torch.sigmoid(s.opacity_slope * (s.opacity_band - state.phi.abs()))
         opacities = torch.sigmoid(self.opacity(features)) * fade[:, None]
         direction = nn.functional.normalize(state.positions - eye, dim=1)
         hidden = torch.relu(self.colour_hidden(torch.cat([features, direction], dim=1)))
         colours = torch.sigmoid(self.colour_out(hidden)).view(n, k, 3)
-        return Children(means, covariances, opacities, colours, offsets)
+        return Children(means, factors, opacities, colours, offsets)
 
     def mean_opacity(self, features: Tensor) -> Tensor:
         """Learned opacity of each carrier, the mean over its children without the fade by phi: [n]."""

@@ -74,7 +74,7 @@ def composite(children: Children, camera: Camera, background: Tensor) -> tuple[T
     """Liquid over the background (liquid in front): rgb [h, w, 3] and the liquid's opacity [h, w]."""
     rgb, alpha = rasterize(
         children.means.flatten(0, 1),
-        children.covariances.flatten(0, 1),
+        children.factors.flatten(0, 1),
         children.opacities.flatten(),
         children.colours.flatten(0, 1),
         camera,
@@ -101,7 +101,7 @@ def total_loss(
     if ssim_weight > 0:
         loss = loss + ssim_weight * losses.ssim_loss(image[near], truth[near])
     loss = loss + weights.silhouette * losses.silhouette_loss(alpha, mask, target.area)
-    loss = loss + weights.covariance * losses.covariance_loss(children.covariances, voxel)
+    loss = loss + weights.covariance * losses.covariance_loss(children.factors, voxel)
     if weights.separation > 0:
         loss = loss + weights.separation * losses.separation_loss(children.offsets)
     if weights.colour > 0:
@@ -116,7 +116,7 @@ def frame_states(carriers: Carriers, grid: Grid) -> list[CarrierState]:
         rows = carriers.rows(t)
         positions = torch.from_numpy(grid.to_scene(carriers.positions[rows]).astype(np.float32))
         deformation = torch.from_numpy(carriers.deformation[rows])
-        states.append(CarrierState.of(positions, deformation, torch.from_numpy(carriers.phi[rows])))
+        states.append(CarrierState(positions, deformation, torch.from_numpy(carriers.phi[rows])))
     return states
 
 

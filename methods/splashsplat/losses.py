@@ -58,9 +58,10 @@ def silhouette_loss(alpha: Tensor, mask: Tensor, area: float) -> Tensor:
     return (alpha - mask).abs().sum() / area
 
 
-def covariance_loss(covariances: Tensor, voxel: float) -> Tensor:
-    """Mean trace of the covariances, in squared transport voxels so that it does not depend on the scene's units."""
-    return covariances.diagonal(dim1=-2, dim2=-1).sum(-1).mean() / voxel**2
+def covariance_loss(factors: Tensor, voxel: float) -> Tensor:
+    """Mean trace of the covariances B B^T of `factors` [..., 3, 3], in squared transport voxels so that it does not
+    depend on the scene's units."""
+    return (factors**2).sum((-2, -1)).mean() / voxel**2
 
 
 def separation_loss(offsets: Tensor) -> Tensor:

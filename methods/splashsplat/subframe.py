@@ -48,5 +48,5 @@ def state_at(liquid: Liquid, time: float) -> tuple[Tensor, CarrierState]:
         here, there = (sample(liquid.phi[frame], positions) / PHI_STEPS_PER_VOXEL for frame in (t, t + 1))
         phi = ((1 - fraction) * here + fraction * there).astype(np.float32)
     scene_positions = torch.from_numpy(liquid.grid.to_scene(positions).astype(np.float32))
-    state = CarrierState.of(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
+    state = CarrierState(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
     return torch.from_numpy(liquid.carriers.ids[rows].astype(np.int64)), state

@@ -97,7 +97,12 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
         _synchronise()
         seconds = time.perf_counter() - start
     fitted.save(Path(request.model))
-    return Outcome(seconds=seconds, settings=config.model_dump(mode="json"), peak_device_memory_bytes=_device_peak())
+    return Outcome(
+        seconds=seconds,
+        settings=config.model_dump(mode="json"),
+        peak_device_memory_bytes=_device_peak(),
+        renderer=_renderers(),
+    )
 
 
 def _reporter(stream: TextIO) -> Callable[[float, str], None]:
@@ -135,6 +140,7 @@ def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
         timed_frames=request.timing_frames,
         primitives_per_frame=statistics.fmean(known) if known else None,
         peak_device_memory_bytes=_device_peak(),
+        renderer=_renderers(),
     )
 
 
@@ -213,6 +219,12 @@ def _primitive_count() -> int | None:
     """Primitives that the shared renderer drew since the last reset, or None for a renderer of the method's own."""
     counters = sys.modules.get("splashbench.render.counters")
     return int(counters.total()) if counters is not None and counters.calls() else None
+
+
+def _renderers() -> list[str]:
+    """The backends of the shared renderer that this process used."""
+    counters = sys.modules.get("splashbench.render.counters")
+    return list(counters.backends()) if counters is not None else []
 
 
 if __name__ == "__main__":

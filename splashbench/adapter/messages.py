@@ -47,3 +47,4 @@ class Outcome(BaseModel):
     primitives_per_frame: float | None = None
     peak_device_memory_bytes: int | None = None
     settings: dict[str, Any] = {}
+    renderer: list[str] = []

@@ -161,7 +161,10 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
         peak = max(peak, watched.peak_memory_bytes)
         if outcome.peak_device_memory_bytes is not None:
             device_peak = max(device_peak or 0, outcome.peak_device_memory_bytes)
-        record = record.model_copy(update={"peak_memory_bytes": peak, "peak_device_memory_bytes": device_peak})
+        used = sorted({*record.renderer, *outcome.renderer})
+        record = record.model_copy(
+            update={"peak_memory_bytes": peak, "peak_device_memory_bytes": device_peak, "renderer": used}
+        )
         if outcome.status != Status.OK:
             return record.model_copy(
                 update={"status": outcome.status, "reason": outcome.reason, "log_tail": watched.log_tail}

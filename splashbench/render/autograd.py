@@ -1,4 +1,4 @@
-"""The renderer as a torch function: the array-level passes of cpu.py behind `torch.autograd.Function`."""
+"""The CPU renderer as a torch function, for one camera or several at once."""
 
 from __future__ import annotations
 
@@ -6,63 +6,70 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from splashbench.render import cpu
-from splashbench.scene.camera import Camera
-
-
-def _array(tensor: torch.Tensor) -> NDArray:
-    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+from splashbench.render.arguments import GAUSSIANS, floats
 
 
 class _Rasterize(torch.autograd.Function):
+    """Inputs: means, factors, opacities, colors (None for none), and a view (camera and options) per camera.
+
+    Outputs: color and opacity of each camera in turn.
+    """
+
     @staticmethod
     def forward(
         ctx: Any,
         means: torch.Tensor,
-        covariances: torch.Tensor,
+        factors: torch.Tensor,
         opacities: torch.Tensor,
-        colors: torch.Tensor,
-        camera: Camera,
-        background: NDArray | None,
-        tile_mask: NDArray[np.bool_] | None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        inputs = (means, covariances, opacities, colors)
-        rendering = cpu.forward(
-            _array(means), _array(covariances), _array(opacities), _array(colors), camera, background, tile_mask
-        )
-        # The arrays are shared with the inputs, as with any saved tensor; here nothing would notice a change in place.
-        ctx.rendering = rendering if any(tensor.requires_grad for tensor in inputs) else None
-        ctx.like = [(tensor.dtype, tensor.device) for tensor in inputs]
-        device = means.device
-        return torch.from_numpy(rendering.rgb).to(device), torch.from_numpy(rendering.alpha).to(device)
+        colors: torch.Tensor | None,
+        views: list[dict[str, Any]],
+    ) -> tuple[torch.Tensor, ...]:
+        tensors = (means, factors, opacities, colors)
+        per_view = colors is not None and colors.ndim == 3
+        arrays = [floats(t, name) for t, name in zip(tensors[:3], GAUSSIANS)]
+        channels = None if colors is None else floats(colors, "colors")
+        renderings = []
+        for i, view in enumerate(views):
+            own = channels[i] if per_view and channels is not None else channels
+            renderings.append(cpu.forward(arrays[0], arrays[1], arrays[2], own, **view))
+        if any(t is not None and t.requires_grad for t in tensors):
+            ctx.renderings, ctx.per_view = renderings, per_view
+            # The kernel reads the inputs again; torch notices where they were changed in place since.
+            ctx.save_for_backward(*[t for t in tensors if t is not None])
+        outputs = []
+        for rendering in renderings:
+            outputs += [torch.from_numpy(image).to(means.device) for image in (rendering.color, rendering.opacity)]
+        ctx.set_materialize_grads(False)
+        return tuple(outputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_rgb: torch.Tensor, grad_alpha: torch.Tensor) -> tuple:
-        gradients = cpu.backward(ctx.rendering, _array(grad_rgb), _array(grad_alpha))
-        moved = [torch.from_numpy(gradient).to(device, dtype) for gradient, (dtype, device) in zip(gradients, ctx.like)]
-        return (*moved, None, None, None)
+    def backward(ctx: Any, *outer: torch.Tensor | None) -> tuple:
+        inputs = list(ctx.saved_tensors)
+        total: tuple | None = None
+        colors: list[np.ndarray] = []
+        for i, rendering in enumerate(ctx.renderings):
+            grads = [None if g is None else g.detach().cpu().numpy() for g in outer[2 * i : 2 * i + 2]]
+            if ctx.per_view and total is not None:
+                total = (*total[:3], np.zeros_like(total[3]))
+            total = rendering.backward(*grads, add_to=total)
+            if ctx.per_view:
+                colors.append(total[3])
+        assert total is not None
+        arrays = [*total[:3], *([np.stack(colors)] if ctx.per_view else total[3:])]
+        moved = [torch.from_numpy(array).to(t.device, t.dtype) for array, t in zip(arrays, inputs)]
+        return (*moved, *([None] * (5 - len(moved))))
 
 
 def rasterize(
     means: torch.Tensor,
-    covariances: torch.Tensor,
+    factors: torch.Tensor,
     opacities: torch.Tensor,
-    colors: torch.Tensor,
-    camera: Camera,
-    background: torch.Tensor | None = None,
-    tile_mask: NDArray[np.bool_] | torch.Tensor | None = None,
-    colors_needed: bool = True,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """See `splashbench.render.rasterize`."""
-    behind = None if background is None else _array(torch.as_tensor(background))
-    mask = None if tile_mask is None else np.asarray(tile_mask, dtype=bool)
-    if colors_needed:
-        return _Rasterize.apply(means, covariances, opacities, colors, camera, behind, mask)
-    black = torch.zeros((len(means), 3), dtype=torch.float32)
-    _, alpha = _Rasterize.apply(means, covariances, opacities, black, camera, None, mask)
-    flat = np.zeros(3, np.float32) if behind is None else behind
-    rgb = np.broadcast_to(flat, (camera.height, camera.width, 3)).copy()
-    return torch.from_numpy(rgb).to(means.device), alpha
+    colors: torch.Tensor | None,
+    views: list[dict[str, Any]],
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """(color, opacity) of each view: the keyword arguments of `cpu.forward`, `camera` among them."""
+    outputs = _Rasterize.apply(means, factors, opacities, colors, views)
+    return list(zip(outputs[::2], outputs[1::2]))

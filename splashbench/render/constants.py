@@ -1,7 +1,7 @@
 """The numbers that fix what an image of Gaussians is: those of gsplat 1.5.3 in its classic mode.
 
 A reconstruction made elsewhere with gsplat renders the same here. The Inria rasterizer differs in the near plane (0.2)
-and the largest alpha (0.99).
+and the largest alpha (0.99). The CPU kernel has these numbers in kernel/constants.h.
 """
 
 from __future__ import annotations
@@ -29,10 +29,6 @@ JACOBIAN_MARGIN = 0.15
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
 LOG2_MAX_ALPHA = math.log2(MAX_ALPHA)
 
-TILE_WIDTH = 32
-TILE_HEIGHT = 16
-"""Tiles are composited on their own; their size affects speed only, never the image.
-
-The compiled kernels hold these numbers, and numba's cache looks at a kernel's own file alone: after a change here,
-delete the __pycache__ beside this file.
-"""
+TILE_WIDTH = 64
+TILE_HEIGHT = 32
+"""Tiles are composited on their own; their size affects speed only, never the image."""

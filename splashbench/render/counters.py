@@ -1,35 +1,42 @@
-"""How many Gaussians were handed to the renderer: the harness reads primitives per frame from here.
+"""What the renderer was asked to do: the harness reads primitives per frame, and the backend used, from here.
 
-Counted per forward call, before anything is culled. Plain module state: a method runs in a process of its own.
+Counted per camera, before anything is culled. Plain module state: a method runs in a process of its own.
 """
 
 from __future__ import annotations
 
 last: int = 0
-"""Gaussians passed to the latest forward call."""
+"""Gaussians of the latest rendering, frozen ones included."""
 _calls: int = 0
 _total: int = 0
+_backends: set[str] = set()
 
 
 def reset() -> None:
-    """Start counting from zero."""
+    """Start counting from zero. The backends seen are kept."""
     global last, _calls, _total
     last, _calls, _total = 0, 0, 0
 
 
-def record(primitives: int) -> None:
-    """Note one forward call on `primitives` Gaussians."""
+def record(primitives: int, backend: str) -> None:
+    """Note one rendering of `primitives` Gaussians by `backend`."""
     global last, _calls, _total
     last = primitives
     _calls += 1
     _total += primitives
+    _backends.add(backend)
 
 
 def calls() -> int:
-    """Forward calls since `reset`."""
+    """Renderings since `reset`."""
     return _calls
 
 
 def total() -> int:
-    """Gaussians passed to all forward calls since `reset`."""
+    """Gaussians of all renderings since `reset`."""
     return _total
+
+
+def backends() -> list[str]:
+    """The backends that this process has rendered with, such as ["cpu (avx2)"]."""
+    return sorted(_backends)

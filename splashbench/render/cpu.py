@@ -1,143 +1,225 @@
-"""Gaussians to pixels on the CPU: the array-level forward and backward passes around the compiled kernels."""
+"""Gaussians to pixels on the CPU: arrays in, arrays out, around the compiled kernel.
+
+`forward` leaves a Rendering, whose `backward` gives the gradients; `freeze` prepares Gaussians that never change.
+"""
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.parallel import on_all_threads
-from splashbench.render import compositing, counters, projection, tiles
+from splashbench.parallel import thread_count
+from splashbench.render import arguments, counters, native
+from splashbench.render.arguments import Floats
+from splashbench.render.constants import TILE_HEIGHT, TILE_WIDTH
+from splashbench.render.tiles import SKIP, Modes
 from splashbench.scene.camera import Camera
 
-Floats = NDArray[np.float32]
+_threads: int | None = None
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Render on `count` threads within the body, for the whole process; else on splashbench.parallel.thread_count()."""
+    global _threads
+    before, _threads = _threads, count
+    try:
+        yield
+    finally:
+        _threads = before
+
+
+def _thread_count() -> int:
+    return min(_threads or thread_count(), native.MAX_THREADS)
+
+
+def _address(array: NDArray | None) -> int | None:
+    return None if array is None else array.__array_interface__["data"][0]
+
+
+def _camera(camera: Camera) -> native.Camera:
+    K = camera.K
+    matrix = (ctypes.c_double * 12)(*camera.w2c[:3].ravel().tolist())
+    return native.Camera(matrix, K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
+
+
+class _Handle:
+    """Owns a frame of the kernel, and what the kernel reads through it."""
+
+    def __init__(self, frame: ctypes.c_void_p, *alive: Any) -> None:
+        self.frame, self._alive = frame, alive
+        self._release = native.library().splash_release  # at exit the module may be gone first
+
+    def __del__(self) -> None:
+        self._release(self.frame)
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """Gaussians that never change, projected, sorted and rendered for one camera; made by `freeze`.
+
+    gaussians: means, factors, opacities and colors as `rasterize` takes them.
+    """
+
+    camera: Camera
+    gaussians: tuple[Floats, Floats, Floats, Floats | None]
+    depth: bool
+    handle: _Handle
+
+    @property
+    def channels(self) -> int:
+        """Colour channels, depth not counted."""
+        colors = self.gaussians[3]
+        return 0 if colors is None else colors.shape[1]
+
+    def __len__(self) -> int:
+        return len(self.gaussians[0])
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the kernel holds for it."""
+        return int(native.library().splash_frame_bytes(self.handle.frame))
 
 
 @dataclass
 class Rendering:
-    """What one forward pass leaves for the backward pass. `rgb` [H, W, 3] and `alpha` [H, W] are the images."""
+    """One camera's images, and what the backward pass needs. color is [H, W, channels], opacity [H, W], or both
+    are compact."""
 
-    rgb: Floats
-    alpha: Floats
-    means: Floats
-    covariances: Floats
-    opacities: Floats
-    camera: Floats
-    background: Floats
-    mask: NDArray[np.bool_]
-    ids: NDArray[np.int64]
-    splats: Floats
-    slot_starts: NDArray[np.int64]
-    tile_starts: NDArray[np.int64]
-    entries: NDArray[np.int32]
-    order: NDArray[np.int64]
-    transmittance: Floats
-    last: Floats
+    color: Floats
+    opacity: Floats
+    handle: _Handle
+    gaussians: tuple[Floats, Floats, Floats, Floats | None]
+
+    def backward(
+        self, grad_color: NDArray | None, grad_opacity: NDArray | None, add_to: tuple[Floats | None, ...] | None = None
+    ) -> tuple[Floats, Floats, Floats, Floats | None]:
+        """Gradients of means [N, 3], factors [N, 3, 3], opacities [N] and colors [N, C] (None where there are none).
+
+        grad_color, grad_opacity: of the loss with respect to the images, in their shapes; None for zero.
+        add_to: gradients to add these to, and to return.
+        """
+        outer = []
+        for name, grad, image in (
+            ("grad_color", grad_color, self.color),
+            ("grad_opacity", grad_opacity, self.opacity),
+        ):
+            if grad is not None:
+                grad = arguments.floats(grad, name)
+                if grad.shape != image.shape:
+                    raise ValueError(f"{name} is {list(grad.shape)}, not {list(image.shape)}")
+            outer.append(grad)
+        gradients = add_to or tuple(None if a is None else np.empty_like(a) for a in self.gaussians)
+        into = native.Gradients(int(add_to is not None), *map(_address, gradients))
+        library = native.library()
+        _raise_for(
+            library.splash_backward(self.handle.frame, *map(_address, outer), _thread_count(), ctypes.byref(into)),
+            self.gaussians,
+        )
+        return gradients  # type: ignore[return-value]
+
+    def counts(self) -> dict[str, int]:
+        """Gaussians drawn, (Gaussian, tile) pairs, and tiles that hold any."""
+        counts = (ctypes.c_int64 * 3)()
+        native.library().splash_frame_counts(self.handle.frame, counts)
+        return dict(zip(("drawn", "pairs", "tiles"), counts))
 
 
-def _floats(array: NDArray, name: str, shape: tuple[int, ...]) -> Floats:
-    """`array` as the kernels want it: float32, C order, writeable (numba compiles anew for anything else)."""
-    result: Floats = np.require(array, dtype=np.float32, requirements=["C", "W"])
-    if result.shape != shape:
-        raise ValueError(f"{name} is {result.shape}, not {shape}")
-    return result
+def _raise_for(status: int, gaussians: tuple[Floats, Floats, Floats, Floats | None]) -> None:
+    if status == native.NOT_FINITE:
+        arguments.check_finite(*gaussians)
+    elif status == native.OUT_OF_MEMORY:
+        raise MemoryError("the renderer is out of memory: fewer Gaussians, smaller ones or smaller images need less")
+    elif status == native.TOO_LARGE:
+        raise ValueError(f"means has {len(gaussians[0])} rows; the renderer takes fewer than 2^31")
 
 
-def _background(background: NDArray | None, height: int, width: int) -> Floats:
-    if background is None:
-        return np.zeros((1, 1, 3), np.float32)
-    array = np.asarray(background)
-    if array.shape == (3,):
-        return _floats(array.reshape(1, 1, 3), "background", (1, 1, 3))
-    return _floats(array, "background", (height, width, 3))
+def _gaussians(
+    means: Any, factors: Any, opacities: Any, colors: Any
+) -> tuple[tuple[Floats, Floats, Floats, Floats | None], native.Gaussians]:
+    channels = arguments.check_shapes(means, factors, opacities, colors)
+    arrays = (
+        arguments.floats(means, "means"),
+        arguments.floats(factors, "factors"),
+        arguments.floats(opacities, "opacities"),
+        None if colors is None else arguments.floats(colors, "colors"),
+    )
+    return arrays, native.Gaussians(len(arrays[0]), channels, *map(_address, arrays))
+
+
+def freeze(means: Any, factors: Any, opacities: Any, colors: Any, camera: Camera, *, depth: bool = False) -> Frozen:
+    """See `splashbench.render.freeze`."""
+    arguments.check_camera(camera)
+    arrays, gaussians = _gaussians(means, factors, opacities, colors)
+    # The arrays are kept beyond this call, so later changes by the caller must not reach them.
+    arrays = tuple(None if a is None else a.copy() for a in arrays)  # type: ignore[assignment]
+    gaussians = native.Gaussians(len(arrays[0]), gaussians.channels, *map(_address, arrays))
+    frame = ctypes.c_void_p()
+    library = native.library()
+    status = library.splash_freeze(
+        ctypes.byref(_camera(camera)), ctypes.byref(gaussians), int(depth), _thread_count(), ctypes.byref(frame)
+    )
+    _raise_for(status, arrays)
+    return Frozen(camera, arrays, depth, _Handle(frame, arrays))
 
 
 def forward(
-    means: NDArray,
-    covariances: NDArray,
-    opacities: NDArray,
-    colors: NDArray,
+    means: Any,
+    factors: Any,
+    opacities: Any,
+    colors: Any,
     camera: Camera,
-    background: NDArray | None = None,
-    tile_mask: NDArray[np.bool_] | None = None,
+    *,
+    background: Any = None,
+    modes: Any = None,
+    frozen: Frozen | None = None,
+    depth: bool = False,
+    compact: bool = False,
 ) -> Rendering:
-    """Render N Gaussians; see `splashbench.render.rasterize` for the arguments. Raises ValueError on wrong shapes."""
-    n = len(means)
-    means = _floats(means, "means", (n, 3))
-    covariances = _floats(covariances, "covariances", (n, 3, 3))
-    opacities = _floats(opacities, "opacities", (n,))
-    colors = _floats(colors, "colors", (n, 3))
-    height, width = camera.height, camera.width
-    grid = tiles.tile_grid(width, height)
-    mask = np.ones(grid, bool) if tile_mask is None else np.require(tile_mask, bool, ["C", "W"])
-    if mask.shape != grid:
-        raise ValueError(f"tile_mask is {mask.shape}, not {grid}; make it with splashbench.render.tile_mask")
-    behind = _background(background, height, width)
-    counters.record(n)
+    """Render for one camera; the arguments are those of `splashbench.render.rasterize`."""
+    arguments.check_camera(camera)
+    arrays, gaussians = _gaussians(means, factors, opacities, colors)
+    channels = gaussians.channels + int(depth)
+    arguments.check_frozen(frozen, camera, gaussians.channels, depth)
+    behind = arguments.check_background(background, camera, gaussians.channels)
+    if behind is not None and depth:
+        behind = np.concatenate([behind, np.zeros((*behind.shape[:-1], 1), np.float32)], axis=-1)
+    tile_modes: Modes | None = arguments.check_modes(modes, camera)
+    counters.record(len(arrays[0]) + (0 if frozen is None else len(frozen)), f"cpu ({native.variant()})")
 
-    row = projection.camera_row(camera.K, camera.w2c, width, height)
-    splats = np.empty((n, projection.SPLAT_COLUMNS), np.float32)
-    depths = np.empty(n, np.float32)
-
-    def project(worker: int, workers: int) -> None:
-        start, stop = worker * n // workers, (worker + 1) * n // workers
-        projection.project(means, covariances, opacities, colors, row, width, height, start, stop, splats, depths)
-
-    on_all_threads(project)
-    ids, splats, slot_starts, tile_starts, entries = tiles.sort_into_tiles(splats, depths, mask)
-    # Longest lists first, dealt to the workers in turn, so that all finish at about the same time.
-    order = np.argsort(-np.diff(tile_starts), kind="stable")
-    rgb = np.empty((height, width, 3), np.float32)
-    transmittance = np.empty((height, width), np.float32)
-    last = np.empty((height, width), np.float32)
-
-    def composite(worker: int, workers: int) -> None:
-        compositing.composite(
-            splats, tile_starts, entries, mask, order, worker, workers, behind, rgb, transmittance, last
-        )
-
-    on_all_threads(composite)
-    return Rendering(
-        rgb, 1 - transmittance, means, covariances, opacities, row, behind, mask, ids, splats, slot_starts,
-        tile_starts, entries, order, transmittance, last,
-    )  # fmt: skip
-
-
-def backward(rendering: Rendering, grad_rgb: NDArray, grad_alpha: NDArray) -> tuple[Floats, Floats, Floats, Floats]:
-    """Gradients of means [N, 3], covariances [N, 3, 3] (symmetric), opacities [N] and colors [N, 3].
-
-    grad_rgb [H, W, 3] and grad_alpha [H, W] are the gradients of the loss with respect to the images.
-    """
-    r = rendering
-    height, width = r.transmittance.shape
-    grad_rgb = _floats(grad_rgb, "grad_rgb", (height, width, 3))
-    grad_alpha = _floats(grad_alpha, "grad_alpha", (height, width))
-    slots = np.empty((len(r.entries), 9), np.float32)
-    lengths = np.diff(r.tile_starts)
-    order = r.order[: int(np.count_nonzero(lengths))]
-
-    def composite(worker: int, workers: int) -> None:
-        compositing.composite_backward(
-            r.splats, r.tile_starts, r.entries, r.mask, order, worker, workers, r.background,
-            r.transmittance, r.last, grad_rgb, grad_alpha, slots,
-        )  # fmt: skip
-
-    on_all_threads(composite)
-    n, drawn = len(r.means), len(r.ids)
-    gradients = (
-        np.zeros((n, 3), np.float32),
-        np.zeros((n, 3, 3), np.float32),
-        np.zeros(n, np.float32),
-        np.zeros((n, 3), np.float32),
+    shape: tuple[int, ...] = (camera.height, camera.width)
+    color_shape = (*shape, channels)
+    if compact:
+        grid = (-(-camera.height // TILE_HEIGHT), -(-camera.width // TILE_WIDTH))
+        kept = grid[0] * grid[1] if tile_modes is None else int(np.count_nonzero(tile_modes != SKIP))
+        shape = (kept, TILE_HEIGHT, TILE_WIDTH)
+        color_shape = (kept, channels, TILE_HEIGHT, TILE_WIDTH)
+    color = np.empty(color_shape, np.float32)
+    opacity = np.empty(shape, np.float32)
+    output = native.Output(
+        int(depth),
+        int(compact),
+        int(behind is not None and behind.ndim == 3),
+        _address(tile_modes),
+        _address(behind),
+        _address(color),
+        _address(opacity),
     )
-
-    def project(worker: int, workers: int) -> None:
-        start, stop = worker * drawn // workers, (worker + 1) * drawn // workers
-        projection.project_backward(
-            r.means, r.covariances, r.opacities, r.camera, r.ids, r.splats, slots, r.slot_starts, start, stop,
-            *gradients,
-        )  # fmt: skip
-
-    on_all_threads(project)
-    return gradients
+    frame = ctypes.c_void_p()
+    library = native.library()
+    status = library.splash_forward(
+        ctypes.byref(_camera(camera)),
+        ctypes.byref(gaussians),
+        ctypes.byref(output),
+        None if frozen is None else frozen.handle.frame,
+        _thread_count(),
+        ctypes.byref(frame),
+    )
+    _raise_for(status, arrays)
+    return Rendering(color, opacity, _Handle(frame, arrays, behind, frozen), arrays)

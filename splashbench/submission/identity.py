@@ -67,4 +67,5 @@ class Record(BaseModel):
     dynamic_bytes: int | None = Field(default=None, ge=0, le=_MOST)
     primitives_per_frame: float | None = Field(default=None, ge=0, le=_MOST)
     carriers_per_frame: float | None = Field(default=None, ge=0, le=_MOST)
+    renderer: list[str] = Field(default_factory=list)  # backends of the shared renderer, such as "cpu (avx2)"
     log_tail: list[str] = Field(default_factory=list)

@@ -203,13 +203,13 @@ class TestModel:
 
     def test_children_start_near_their_anchor_with_its_colour(self):
         model = self.model()
-        means, covariances, opacities, colors, scales = model.decode(np.array([0.0, 0, 9]))
+        means, factors, opacities, colors, scales = model.decode(np.array([0.0, 0, 9]))
         assert means.shape == (60, 3)
         assert (torch.linalg.norm(means.view(20, 3, 3) - model.positions[:, None], dim=2) < 1.3).all()
         base = torch.sigmoid(model.features[:, :3])
         assert (colors.view(20, 3, 3) - base[:, None]).abs().mean() < 0.1
         assert (opacities > 0.3).all()
-        np.testing.assert_allclose(torch.linalg.det(covariances).detach(), scales.prod(1).detach() ** 2, rtol=1e-3)
+        np.testing.assert_allclose(torch.linalg.det(factors).abs().detach(), scales.prod(1).detach(), rtol=1e-3)
 
     def test_children_of_non_positive_opacity_are_not_drawn(self):
         model = self.model()

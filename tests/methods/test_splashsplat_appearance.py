@@ -22,7 +22,7 @@ def decoder_with_constant_heads(**settings) -> Decoder:
 
 
 def state(deformation: torch.Tensor, phi: float = 0.0) -> CarrierState:
-    return CarrierState.of(torch.tensor([[1.0, 2.0, 3.0]]), deformation[None], torch.tensor([phi]))
+    return CarrierState(torch.tensor([[1.0, 2.0, 3.0]]), deformation[None], torch.tensor([phi]))
 
 
 def test_children_start_one_unit_apart_in_the_carriers_frame():
@@ -44,7 +44,8 @@ def test_covariance_follows_deformation_and_scale():
     children = decoder(torch.zeros(1, 4), base.log()[None], state(shear), torch.zeros(3))
     grown = 0.5 * 2 * math.tanh(0.3)
     B = shear @ torch.diag(base * torch.tensor([math.exp(grown), 1, 1])) / math.sqrt(2)
-    np.testing.assert_allclose(children.covariances[0, 0].detach(), (B @ B.T).detach(), rtol=1e-5, atol=1e-8)
+    got = children.factors[0, 0]
+    np.testing.assert_allclose((got @ got.T).detach(), (B @ B.T).detach(), rtol=1e-5, atol=1e-8)
 
 
 def test_opacity_fades_away_from_the_interface():
@@ -62,7 +63,7 @@ def test_colour_sees_the_viewing_direction_and_shape_does_not():
     front, side = decoder(*arguments, torch.zeros(3)), decoder(*arguments, torch.tensor([9.0, 0, 0]))
     assert not torch.allclose(front.colours, side.colours)
     assert torch.equal(front.means, side.means)
-    assert torch.equal(front.covariances, side.covariances)
+    assert torch.equal(front.factors, side.factors)
 
 
 def images() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -93,8 +94,8 @@ def test_silhouette_loss_counts_both_sides_of_the_outline():
 
 
 def test_covariance_loss_is_the_mean_trace_in_voxels():
-    covariances = torch.diag(torch.tensor([1.0, 2.0, 3.0])).expand(4, 2, 3, 3)
-    assert float(losses.covariance_loss(covariances, voxel=2.0)) == pytest.approx(6 / 4)
+    factors = torch.diag(torch.tensor([1.0, 2.0, 3.0]).sqrt()).expand(4, 2, 3, 3)
+    assert float(losses.covariance_loss(factors, voxel=2.0)) == pytest.approx(6 / 4)
 
 
 def test_separation_loss_is_a_squared_hinge():

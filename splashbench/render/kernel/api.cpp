@@ -1,0 +1,212 @@
+// The C interface: checks nothing (../native.py does), turns exceptions into a status, and keeps frames for later calls.
+
+#include "api.h"
+
+#include <algorithm>
+#include <mutex>
+#include <new>
+#include <vector>
+
+#include "frame.h"
+#include "threads.h"
+
+struct SplashFrame {
+    splash::Frame frame;
+};
+
+namespace splash {
+namespace {
+
+// Frames given back, most recent last: their buffers fit the next call.
+constexpr size_t KEPT = 4;
+std::mutex kept_mutex;
+std::vector<SplashFrame*>& kept() {
+    static std::vector<SplashFrame*>* const frames = new std::vector<SplashFrame*>;
+    return *frames;
+}
+
+SplashFrame* take_frame() {
+    {
+        std::lock_guard<std::mutex> lock(kept_mutex);
+        if (!kept().empty()) {
+            SplashFrame* const frame = kept().back();
+            kept().pop_back();
+            return frame;
+        }
+    }
+    return new SplashFrame();
+}
+
+Camera camera_of(const SplashCamera& given) {
+    Camera camera;
+    camera.exact = given;
+    for (int i = 0; i < 9; ++i) camera.rotation[i] = static_cast<float>(given.world_to_camera[i / 3 * 4 + i % 3]);
+    camera.fx = static_cast<float>(given.fx);
+    camera.fy = static_cast<float>(given.fy);
+    camera.width = given.width;
+    camera.height = given.height;
+    const double margin_x = JACOBIAN_MARGIN * given.width, margin_y = JACOBIAN_MARGIN * given.height;
+    camera.min_tx = static_cast<float>((-given.cx - margin_x) / given.fx);
+    camera.max_tx = static_cast<float>((given.width - given.cx + margin_x) / given.fx);
+    camera.min_ty = static_cast<float>((-given.cy - margin_y) / given.fy);
+    camera.max_ty = static_cast<float>((given.height - given.cy + margin_y) / given.fy);
+    return camera;
+}
+
+// The summed area of tiles that are not skipped, and where these stand in the compact output.
+void set_modes(Frame& frame, const uint8_t* modes) {
+    frame.modes.fit(frame.tiles);
+    frame.compact_places.fit(frame.tiles);
+    int32_t place = 0;
+    frame.skips = false;
+    for (int tile = 0; tile < frame.tiles; ++tile) {
+        frame.modes[tile] = modes == nullptr ? static_cast<uint8_t>(COLOR) : modes[tile];
+        frame.compact_places[tile] = frame.modes[tile] == SKIP ? -1 : place++;
+        frame.skips |= frame.modes[tile] == SKIP;
+    }
+    const int stride = frame.tile_columns + 1;
+    int32_t* const above = frame.active_above.fit(static_cast<size_t>(frame.tile_rows + 1) * stride);
+    std::fill(above, above + stride, 0);
+    for (int row = 0; row < frame.tile_rows; ++row) {
+        above[(row + 1) * stride] = 0;
+        for (int column = 0; column < frame.tile_columns; ++column) {
+            const int at = row * stride + column;
+            above[at + stride + 1] = above[at + stride] + above[at + 1] - above[at] +
+                                     (frame.modes[row * frame.tile_columns + column] != SKIP);
+        }
+    }
+}
+
+int workers(int32_t threads) { return std::clamp<int32_t>(threads, 1, MAX_THREADS); }
+
+// Steps 1 to 3.
+int prepare(Frame& frame, const SplashCamera& camera, const SplashGaussians& gaussians, bool depth, const uint8_t* modes,
+            const Frame* frozen, int32_t threads) {
+    if (gaussians.count >= INT32_MAX) return SPLASH_TOO_LARGE;
+    frame.camera = camera_of(camera);
+    frame.tile_columns = (camera.width + TILE_WIDTH - 1) / TILE_WIDTH;
+    frame.tile_rows = (camera.height + TILE_HEIGHT - 1) / TILE_HEIGHT;
+    frame.tiles = frame.tile_columns * frame.tile_rows;
+    frame.threads = workers(threads);
+    frame.gaussians = gaussians;
+    frame.with_depth = depth;
+    frame.channels = gaussians.channels + (depth ? 1 : 0);
+    frame.table_colors = frame.channels != 3 || depth;
+    frame.frozen = frozen;
+    set_modes(frame, modes);
+    if (!project(frame)) return SPLASH_NOT_FINITE;
+    sort_by_depth(frame);
+    bin(frame);
+    return SPLASH_DONE;
+}
+
+}  // namespace
+}  // namespace splash
+
+extern "C" {
+
+int splash_forward(const SplashCamera* camera, const SplashGaussians* gaussians, const SplashOutput* output,
+                   const SplashFrame* frozen, int32_t threads, SplashFrame** result) {
+    SplashFrame* held = nullptr;
+    try {
+        held = splash::take_frame();
+        splash::Frame& frame = held->frame;
+        frame.compact = output->compact != 0;
+        frame.background = output->background;
+        frame.background_per_pixel = output->background_per_pixel != 0;
+        const int status = splash::prepare(frame, *camera, *gaussians, output->depth != 0, output->modes,
+                                           frozen == nullptr ? nullptr : &frozen->frame, threads);
+        if (status != SPLASH_DONE) {
+            splash_release(held);
+            return status;
+        }
+        splash::blend(frame, output->color, output->opacity);
+        *result = held;
+        return SPLASH_DONE;
+    } catch (const std::bad_alloc&) {
+        delete held;
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+int splash_freeze(const SplashCamera* camera, const SplashGaussians* gaussians, int32_t depth, int32_t threads,
+                  SplashFrame** result) {
+    SplashFrame* held = nullptr;
+    try {
+        held = new SplashFrame();
+        const int status = splash::prepare(held->frame, *camera, *gaussians, depth != 0, nullptr, nullptr, threads);
+        if (status != SPLASH_DONE) {
+            delete held;
+            return status;
+        }
+        splash::bake(held->frame);
+        *result = held;
+        return SPLASH_DONE;
+    } catch (const std::bad_alloc&) {
+        delete held;
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+int splash_backward(SplashFrame* held, const float* grad_color, const float* grad_opacity, int32_t threads,
+                    const SplashGradients* gradients) {
+    try {
+        held->frame.threads = splash::workers(threads);
+        splash::backward(held->frame, grad_color, grad_opacity, *gradients);
+        return SPLASH_DONE;
+    } catch (const std::bad_alloc&) {
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+void splash_release(SplashFrame* held) {
+    if (held == nullptr) return;
+    {
+        std::lock_guard<std::mutex> lock(splash::kept_mutex);
+        if (splash::kept().size() < splash::KEPT) {
+            splash::kept().push_back(held);
+            return;
+        }
+    }
+    delete held;
+}
+
+void splash_trim(void) {
+    std::lock_guard<std::mutex> lock(splash::kept_mutex);
+    for (SplashFrame* held : splash::kept()) delete held;
+    splash::kept().clear();
+}
+
+int64_t splash_frame_bytes(const SplashFrame* held) {
+    const splash::Frame& f = held->frame;
+    return static_cast<int64_t>(
+        f.modes.bytes() + f.active_above.bytes() + f.projected.bytes() + f.keys.bytes() + f.ranks.bytes() + f.items.bytes() +
+        f.other_items.bytes() + f.histograms.bytes() + f.splats.bytes() + f.channel_table.bytes() + f.slot_starts.bytes() +
+        f.tile_starts.bytes() + f.entries.bytes() + f.tile_counts.bytes() + f.places.bytes() + f.order.bytes() +
+        f.transmittance.bytes() + f.stops.bytes() + f.baked.bytes() + f.compact_places.bytes() + f.slots.bytes());
+}
+
+void splash_frame_counts(const SplashFrame* held, int64_t counts[3]) {
+    counts[0] = held->frame.drawn;
+    counts[1] = held->frame.tile_starts[held->frame.tiles];
+    counts[2] = held->frame.placed;
+}
+
+int splash_abi_version(void) { return SPLASH_ABI_VERSION; }
+
+const char* splash_variant(void) { return SPLASH_VARIANT; }
+
+int splash_tile_width(void) { return splash::TILE_WIDTH; }
+
+int splash_tile_height(void) { return splash::TILE_HEIGHT; }
+
+void splash_constants(double values[6]) {
+    values[0] = splash::NEAR_PLANE;
+    values[1] = splash::BLUR_VARIANCE;
+    values[2] = splash::MIN_ALPHA;
+    values[3] = splash::MAX_ALPHA;
+    values[4] = splash::MIN_TRANSMITTANCE;
+    values[5] = splash::JACOBIAN_MARGIN;
+}
+
+}  // extern "C"

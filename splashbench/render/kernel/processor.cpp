@@ -1,0 +1,31 @@
+// Which variant of the kernel this processor runs. Asked by hand, because the compilers' own question needs a run-time
+// library that not all of them bring.
+
+#include "api.h"
+
+#if defined(__x86_64__) || defined(_M_X64)
+#include <cpuid.h>
+
+namespace {
+
+// Whether the processor has the instructions of x86-64-v3 (AVX2 and its kin), and the system saves their registers.
+bool runs_x86_64_v3() {
+    unsigned a, b, c, d;
+    const unsigned first = bit_FMA | bit_MOVBE | bit_OSXSAVE | bit_AVX | bit_F16C;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & first) != first) return false;
+    unsigned saved, high;
+    __asm__("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+    const unsigned sse_and_avx = 6;
+    if ((saved & sse_and_avx) != sse_and_avx) return false;
+    const unsigned second = bit_BMI | bit_AVX2 | bit_BMI2;
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (b & second) != second) return false;
+    return __get_cpuid(0x80000001, &a, &b, &c, &d) && (c & bit_LZCNT) != 0;
+}
+
+}  // namespace
+
+// The avx512 variant is there for those who ask for it: its gain has not been measured.
+extern "C" const char* splash_best_variant(void) { return runs_x86_64_v3() ? "avx2" : "baseline"; }
+#else
+extern "C" const char* splash_best_variant(void) { return "neon"; }
+#endif
