@@ -8,8 +8,9 @@ over the rounds of A's time over B's in the same round, so that a slow spell of 
 
 prototype_ratio     ours / the C++ prototype in DIR, which is compiled here and now, on scenes iii, i and ii. The
                     prototype takes covariances, made outside the clock.
-torch_ratio         tests/render/reference.py (plain torch, float32) / ours on scene i. The reference runs once on one
-                    torch thread and once on two; the faster run counts.
+torch_ratio         the plain torch renderer in DIR (ref_torch.py, vectorised over groups of tiles) / ours on scene i,
+                    float32. It runs once on one torch thread and once on two; the faster run counts.
+torch_ratio_reference  the same for tests/render/reference.py, which is the faster of the two.
 thread_scaling      one thread / two threads, scene i.
 mask_speedup        all tiles / those that a centered disc of 20% of the pixels touches, the others skipped. The scene:
                     85 000 Gaussians all over 1200x1800. The table also has it for compact output.
@@ -255,23 +256,47 @@ class Benchmark:
         if difference > 1e-2:
             raise RuntimeError(f"scene {name}: the prototype's gradient of colors is {difference:.1e} away from ours")
 
-    def torch_ratio(self) -> float:
-        """The plain torch reference over ours."""
+    def torch_ratio(self) -> dict[str, float | None]:
+        """Plain torch over ours: that of the prototype's folder, and the tests' reference."""
         scene = make_scene(*SCENES["i"])
-        inputs, outer, rasterize_plainly = leaves(scene.gaussians), image_gradients(scene.camera), reference().rasterize
-        ours = our_pass(scene.gaussians, scene.camera, outer)
-        plain, fast = [], []
-        before = torch.get_num_threads()
-        for threads in (1, THREADS):
-            torch.set_num_threads(threads)
-            start = time.perf_counter()
-            images = rasterize_plainly(*inputs, scene.camera, background=BACKGROUND)
-            torch.autograd.grad(images, inputs, outer)
-            plain.append(1e3 * (time.perf_counter() - start))
-            torch.set_num_threads(before)
-            fast += take_turns({"ours": ours}, self.repeats)["ours"]
-        self.medians_ms |= {"plain torch": round(min(plain), 3), "plain torch ours": round(statistics.median(fast), 3)}
-        return min(plain) / statistics.median(fast)
+        camera, gaussians, outer = scene.camera, scene.gaussians, image_gradients(scene.camera)
+        inputs = leaves(gaussians)
+        ours = our_pass(gaussians, camera, outer)
+        definition = reference().rasterize
+        plain: dict[str, Pass] = {
+            "reference": lambda: torch.autograd.grad(definition(*inputs, camera, background=BACKGROUND), inputs, outer)
+        }
+        module = None if self.prototype is None else self.prototype / "ref_torch.py"
+        if module is None or not module.is_file():
+            self.missing["torch_ratio"] = "no ref_torch.py in --prototype DIR; torch_ratio_reference is measured"
+        else:
+            render = load_module(module).render
+            w2c, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (camera.w2c, camera.K))
+
+            def of_prototype() -> tuple[torch.Tensor, ...]:
+                covariances = inputs.factors @ inputs.factors.transpose(1, 2)
+                arguments = inputs._replace(factors=covariances)
+                images = render(*arguments, w2c, K, camera.width, camera.height, BACKGROUND)
+                return torch.autograd.grad(images, inputs, outer)
+
+            plain["prototype"] = of_prototype
+        ratios: dict[str, float | None] = {"prototype": None}
+        for name, one_pass in plain.items():
+            slow, fast = [], []
+            before = torch.get_num_threads()
+            for threads in (1, THREADS):
+                torch.set_num_threads(threads)
+                start = time.perf_counter()
+                one_pass()
+                slow.append(1e3 * (time.perf_counter() - start))
+                torch.set_num_threads(before)
+                fast += take_turns({"ours": ours}, self.repeats)["ours"]
+            self.medians_ms |= {
+                f"plain torch ({name})": round(min(slow), 3),
+                f"plain torch ({name}), ours": round(statistics.median(fast), 3),
+            }
+            ratios[name] = min(slow) / statistics.median(fast)
+        return ratios
 
     def thread_scaling(self) -> float:
         """One thread over two."""
@@ -347,7 +372,9 @@ class Benchmark:
 
     def run(self) -> dict[str, Any]:
         """Everything that the JSON holds."""
-        results: dict[str, Any] = {"prototype_ratio": self.prototype_ratio(), "torch_ratio": self.torch_ratio()}
+        results: dict[str, Any] = {"prototype_ratio": self.prototype_ratio()}
+        plain = self.torch_ratio()
+        results["torch_ratio"], results["torch_ratio_reference"] = plain["prototype"], plain["reference"]
         results["thread_scaling"] = self.thread_scaling()
         masks = self.mask_speedup()
         results["mask_speedup"] = masks["masked"]

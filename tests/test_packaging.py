@@ -55,6 +55,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for path in checkout_files():
         (copy / path).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / path, copy / path)
+    compiled = ROOT / "build" / "kernel"  # taken over where its digests still fit
+    if compiled.is_dir():
+        shutil.copytree(compiled, copy / "build" / "kernel", ignore=shutil.ignore_patterns("zig", "new-*"))
     built = tmp_path_factory.mktemp("wheel")
     code = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
     done = subprocess.run([sys.executable, "-c", code, str(built)], cwd=copy, capture_output=True, text=True)

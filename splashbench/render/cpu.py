@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.parallel import thread_count
-from splashbench.render import arguments, counters, native
+from splashbench.render import arguments, counters, memory, native
 from splashbench.render.arguments import Floats
 from splashbench.render.constants import TILE_HEIGHT, TILE_WIDTH
 from splashbench.render.tiles import SKIP, Modes
@@ -115,7 +115,7 @@ class Rendering:
                 if grad.shape != image.shape:
                     raise ValueError(f"{name} is {list(grad.shape)}, not {list(image.shape)}")
             outer.append(grad)
-        gradients = add_to or tuple(None if a is None else np.empty_like(a) for a in self.gaussians)
+        gradients = add_to or tuple(None if a is None else memory.empty(a.shape) for a in self.gaussians)
         into = native.Gradients(int(add_to is not None), *map(_address, gradients))
         library = native.library()
         _raise_for(
@@ -200,8 +200,7 @@ def forward(
         kept = grid[0] * grid[1] if tile_modes is None else int(np.count_nonzero(tile_modes != SKIP))
         shape = (kept, TILE_HEIGHT, TILE_WIDTH)
         color_shape = (kept, channels, TILE_HEIGHT, TILE_WIDTH)
-    color = np.empty(color_shape, np.float32)
-    opacity = np.empty(shape, np.float32)
+    color, opacity = memory.empty(color_shape), memory.empty(shape)
     output = native.Output(
         int(depth),
         int(compact),

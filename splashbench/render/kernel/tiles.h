@@ -2,6 +2,7 @@
 // pixels beside the ellipse.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 
 #include "frame.h"
@@ -15,23 +16,24 @@ struct TileRange {
     int left, right, top, bottom;  // right and bottom excluded
 };
 
-inline int tile_index(float pixel, float size, int count) {
-    const float tile = std::floor(pixel / size);
-    return tile < 0.0f ? 0 : tile > static_cast<float>(count) ? count : static_cast<int>(tile);
+// The tile along one axis that holds a pixel, the nearest one for pixels beyond the image.
+inline int tile_index(float pixel, float size, int last) {
+    return static_cast<int>(std::min(std::max(pixel / size, 0.0f), static_cast<float>(last)));
 }
 
-// The tiles that hold a pixel of the box at (x, y) px, that far from it to either side.
+// The tiles that hold a pixel of the box at (x, y) px, that far from it to either side. Written without branches: whether a
+// Gaussian is in the image is anyone's guess.
 inline TileRange box_range(const Frame& frame, double center_x, double center_y, float half_width, float half_height) {
-    TileRange range = {0, 0, 0, 0};
     const float x = static_cast<float>(center_x) - 0.5f, y = static_cast<float>(center_y) - 0.5f;
     const float left = x - half_width - SLACK, right = x + half_width + SLACK;
     const float top = y - half_height - SLACK, bottom = y + half_height + SLACK;
-    if (right < 0.0f || bottom < 0.0f || left > frame.camera.width - 1 || top > frame.camera.height - 1) return range;
-    range.left = tile_index(left, TILE_WIDTH, frame.tile_columns - 1);
-    range.right = tile_index(right, TILE_WIDTH, frame.tile_columns - 1) + 1;
-    range.top = tile_index(top, TILE_HEIGHT, frame.tile_rows - 1);
-    range.bottom = tile_index(bottom, TILE_HEIGHT, frame.tile_rows - 1) + 1;
-    return range;
+    const int inside = static_cast<int>(right >= 0.0f) & static_cast<int>(bottom >= 0.0f) &
+                       static_cast<int>(left <= static_cast<float>(frame.camera.width - 1)) &
+                       static_cast<int>(top <= static_cast<float>(frame.camera.height - 1));
+    const int last_column = frame.tile_columns - 1, last_row = frame.tile_rows - 1;
+    const int first_left = tile_index(left, TILE_WIDTH, last_column), first_top = tile_index(top, TILE_HEIGHT, last_row);
+    return {first_left, inside ? tile_index(right, TILE_WIDTH, last_column) + 1 : first_left, first_top,
+            inside ? tile_index(bottom, TILE_HEIGHT, last_row) + 1 : first_top};
 }
 
 inline TileRange tile_range(const Frame& frame, const Splat& s) {

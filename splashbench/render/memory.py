@@ -1,0 +1,44 @@
+"""Memory for images and gradients, used again once nobody holds them.
+
+Fresh memory of an image's size costs as much as writing the image twice over: the system hands it out page by page,
+each cleared first. An array handed out is a view of a buffer kept here; a buffer without other references is free.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Smaller arrays come from the heap, which keeps its memory itself.
+SMALLEST_BYTES = 1 << 20
+KEPT_BYTES = 1 << 28
+
+_lock = threading.Lock()
+_buffers: list[NDArray[np.float32]] = []  # least recently handed out first
+
+
+# What getrefcount says of an array that nothing but a list holds.
+_probe = [np.empty(1, np.float32)]
+_IDLE = sys.getrefcount(_probe[0])
+
+
+def empty(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """An uninitialised C-contiguous float32 array."""
+    count = math.prod(shape)
+    if 4 * count < SMALLEST_BYTES:
+        return np.empty(shape, np.float32)
+    with _lock:
+        for i in range(len(_buffers)):
+            # Not one that is far too large: it would be missed where it fits.
+            if count <= _buffers[i].size <= 2 * count and sys.getrefcount(_buffers[i]) <= _IDLE:
+                _buffers.append(_buffers.pop(i))
+                return _buffers[-1][:count].reshape(shape)
+        fresh = np.empty(count, np.float32)
+        _buffers.append(fresh)
+        while len(_buffers) > 1 and sum(kept.nbytes for kept in _buffers) > KEPT_BYTES:
+            _buffers.pop(0)  # lives on for as long as somebody holds a view of it
+        return fresh.reshape(shape)

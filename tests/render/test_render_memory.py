@@ -1,0 +1,68 @@
+"""Images' memory is used again once nobody holds them, and never while somebody does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.render import memory
+
+SHAPE = (600, 500, 3)
+
+
+def address(array: np.ndarray) -> int:
+    return array.__array_interface__["data"][0]
+
+
+@pytest.fixture(autouse=True)
+def _no_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_buffers", [])
+
+
+def test_memory_nobody_holds_is_used_again():
+    first = memory.empty(SHAPE)
+    place = address(first)
+    del first
+    again = memory.empty(SHAPE)
+    assert (address(again), again.shape, again.dtype) == (place, SHAPE, np.float32)
+    del again
+    assert address(memory.empty((500, 500, 3))) == place
+
+
+def test_memory_that_is_held_is_left_alone():
+    first = memory.empty(SHAPE)
+    tensor = torch.from_numpy(first)
+    part = tensor[5:7].permute(2, 0, 1)
+    place = address(first)
+    del first, tensor
+    part[:] = 7.0
+    others = [memory.empty(SHAPE) for _ in range(3)]
+    assert place not in {address(array) for array in others}
+    for array in others:
+        array[:] = 0
+    assert (part == 7).all()
+    del part
+    assert address(memory.empty(SHAPE)) == place
+
+
+def test_a_small_need_does_not_take_a_large_buffer():
+    large = memory.empty((2000, 1000))
+    place = address(large)
+    del large
+    assert address(memory.empty((600, 1000))) != place
+
+
+def test_only_so_much_is_kept(monkeypatch):
+    monkeypatch.setattr(memory, "KEPT_BYTES", 10_000_000)
+    arrays = [memory.empty(SHAPE) for _ in range(8)]  # 3.6 MB each
+    assert len(memory._buffers) == 2
+    for i, array in enumerate(arrays):
+        array[:] = i
+    assert [array[0, 0, 0] for array in arrays] == list(range(8))
+
+
+def test_small_arrays_are_ordinary_ones():
+    assert memory.empty((10, 3)).base is None
+    assert memory.empty((0, 3)).shape == (0, 3)
+    assert memory._buffers == []
