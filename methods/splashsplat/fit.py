@@ -72,14 +72,17 @@ def initial_appearance(
 
 def composite(children: Children, camera: Camera, background: Tensor) -> tuple[Tensor, Tensor]:
     """Liquid over the background (liquid in front): rgb [h, w, 3] and the liquid's opacity [h, w]."""
-    rgb, alpha = rasterize(
+    image: Tensor
+    alpha: Tensor
+    image, alpha = rasterize(
         children.means.flatten(0, 1),
         children.factors.flatten(0, 1),
         children.opacities.flatten(),
         children.colours.flatten(0, 1),
         camera,
+        background=background,
     )
-    return rgb + (1 - alpha)[..., None] * background, alpha
+    return image, alpha
 
 
 def total_loss(
