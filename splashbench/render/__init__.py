@@ -41,10 +41,15 @@ Cameras = Camera | Sequence[Camera]
 
 def _views(cameras: Cameras, background: Any, modes: Any, frozen: Any, options: dict[str, Any]) -> list[dict[str, Any]]:
     """A camera's own keyword arguments, per camera."""
+    options = {name: arguments.check_flag(value, name) for name, value in options.items()}
     if isinstance(cameras, Camera):
+        if isinstance(frozen, list | tuple):
+            raise TypeError("frozen is a list, for a single camera")
         return [{"camera": cameras, "background": background, "modes": modes, "frozen": frozen, **options}]
     if not isinstance(cameras, Sequence):
         arguments.check_camera(cameras)
+    if not cameras:
+        raise ValueError("cameras is empty")
     views: list[dict[str, Any]] = [{"camera": arguments.check_camera(camera), **options} for camera in cameras]
     for name, value in (("modes", modes), ("frozen", frozen), ("background", background)):
         per_camera = isinstance(value, list | tuple)
@@ -121,7 +126,7 @@ def rasterize(
         modes: uint8 [tile rows, tile columns], see `tile_modes`; all COLOR by default. Where a tile is not COLOR its
             color is the background, where it is SKIP its opacity is 0, and neither has a gradient.
         frozen: what `freeze` made for this camera of Gaussians that get no gradients. The images are those of all
-            Gaussians together, bit for bit (at equal depth, these come first).
+            Gaussians together, bit for bit; at equal depth, the frozen ones come last.
         depth: append a channel to color: the sum of compositing weight times depth along the optical axis, scene
             units. Divided by opacity it is the mean depth. Its background is 0.
         compact: return tiles, [K, C, TILE_HEIGHT, TILE_WIDTH] and [K, TILE_HEIGHT, TILE_WIDTH], see `to_tiles`.
@@ -129,7 +134,8 @@ def rasterize(
             where it is there. A run's record names the backend that was used.
 
     Opacity is 1 minus the transmittance. Gaussians behind the near plane, fainter than one grey level or off the image
-    are not drawn and get zero gradients. On the CPU images and gradients repeat bit for bit.
+    are not drawn and get zero gradients; on the CPU, nor are those over a million pixels wide, beyond the digits of
+    float32. On the CPU images and gradients repeat bit for bit.
 
     Raises:
         ValueError: an argument has the wrong shape, or holds a NaN or an infinity; TypeError: the wrong type. Both name

@@ -17,20 +17,25 @@ from splashbench.scene.camera import Camera
 Floats = NDArray[np.float32]
 
 GAUSSIANS = ("means", "factors", "opacities", "colors")
+LARGEST_SIDE = 1 << 17
+LARGEST_INTRINSIC = 1e9
 
 
 def floats(value: Any, name: str) -> Floats:
     """`value` (array, tensor or nested list of floating point numbers) as a C-contiguous float32 array."""
-    if hasattr(value, "detach"):  # a torch tensor; torch need not be there
-        value = value.detach().cpu()
-        if value.is_floating_point():
-            value = value.float()
-        value = value.numpy()
-    array = np.asarray(value)
+    try:
+        if hasattr(value, "detach"):  # a torch tensor; torch need not be there
+            value = value.detach().cpu()
+            if value.is_floating_point():
+                value = value.float()
+            value = value.numpy()
+        array = np.asarray(value)
+    except (NotImplementedError, RuntimeError, TypeError, ValueError) as error:
+        raise TypeError(f"{name} cannot be read as an array of numbers: {error}") from None
     if array.dtype.kind != "f" and array.size:
         raise TypeError(f"{name} is {array.dtype}, not floating point")
     with np.errstate(over="ignore"):  # what overflows is infinite, and refused as that
-        return np.ascontiguousarray(array, np.float32)
+        return np.require(array, np.float32, ["C", "A"])
 
 
 def check_shapes(means: Any, factors: Any, opacities: Any, colors: Any) -> int:
@@ -65,6 +70,13 @@ def check_camera(camera: Any) -> Camera:
     """`camera` itself; TypeError or ValueError where the renderer cannot take it."""
     if not isinstance(camera, Camera):
         raise TypeError(f"cameras is a {type(camera).__name__}, not a splashbench.scene.Camera or a sequence of them")
+    sizes = (camera.width, camera.height)
+    if not all(isinstance(size, int | np.integer) and size <= LARGEST_SIDE for size in sizes):
+        raise ValueError(
+            f"cameras: camera {camera.name} is {sizes} px; the renderer takes whole numbers to {LARGEST_SIDE}"
+        )
+    if np.abs(camera.K).max() > LARGEST_INTRINSIC:
+        raise ValueError(f"cameras: K of camera {camera.name} has entries above {LARGEST_INTRINSIC:g} px")
     skew = camera.K[0, 1]
     if skew != 0 or (camera.K[1, 0], camera.K[2, 0], camera.K[2, 1], camera.K[2, 2]) != (0, 0, 0, 1):
         raise ValueError(f"cameras: K of camera {camera.name} is not a pinhole's without skew (K[0, 1] is {skew})")
@@ -81,7 +93,9 @@ def check_background(background: Any, camera: Camera, channels: int) -> Floats |
             f"background is {list(array.shape)}, not [{channels}] or [{camera.height}, {camera.width}, {channels}]"
         )
     # The sum is not finite where an entry is not (or, at worst, where it overflows).
-    if not np.isfinite(array.sum(dtype=np.float64)) and not np.isfinite(array).all():
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = array.sum(dtype=np.float64)
+    if not np.isfinite(total) and not np.isfinite(array).all():
         raise ValueError("background holds values that are not finite")
     return array
 
@@ -90,7 +104,10 @@ def check_modes(modes: Any, camera: Camera) -> Modes | None:
     """The modes as uint8 [tile rows, tile columns]; a bool array means COLOR where True, else SKIP."""
     if modes is None:
         return None
-    array = np.asarray(modes)
+    try:
+        array = np.asarray(modes.detach().cpu() if hasattr(modes, "detach") else modes)
+    except (NotImplementedError, RuntimeError, TypeError, ValueError) as error:
+        raise TypeError(f"modes cannot be read as an array of numbers: {error}") from None
     grid = tile_grid(camera.width, camera.height)
     if array.shape != grid:
         raise ValueError(
@@ -112,12 +129,23 @@ def check_tensor(value: Any, name: str, optional: bool = False) -> None:
         raise TypeError(f"{name} is a {type(value).__name__}, not a torch tensor")
     if not value.is_floating_point():
         raise TypeError(f"{name} is {value.dtype}, not floating point")
+    if value.is_meta or value.is_sparse:
+        raise TypeError(f"{name} holds no dense values (a sparse tensor, or one on the meta device)")
+
+
+def check_flag(value: Any, name: str) -> bool:
+    """`value` itself; TypeError unless it is a bool."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} is {value!r}, not True or False")
+    return bool(value)
 
 
 def check_frozen(frozen: Any, camera: Camera, channels: int, depth: bool) -> None:
     """Raise ValueError unless `frozen` is None or was made for this camera and these channels."""
     if frozen is None:
         return
+    if not hasattr(frozen, "gaussians"):
+        raise TypeError(f"frozen is a {type(frozen).__name__}, not what splashbench.render.freeze makes")
     same = (
         (frozen.camera.width, frozen.camera.height) == (camera.width, camera.height)
         and np.array_equal(frozen.camera.K, camera.K)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from splashbench.parallel import thread_count
 from splashbench.render import arguments, counters, memory, native
 from splashbench.render.arguments import Floats
 from splashbench.render.constants import TILE_HEIGHT, TILE_WIDTH
-from splashbench.render.tiles import SKIP, Modes
+from splashbench.render.tiles import SKIP, Modes, tile_grid
 from splashbench.scene.camera import Camera
 
 _threads: int | None = None
@@ -50,17 +51,25 @@ def _camera(camera: Camera) -> native.Camera:
 
 
 class _Handle:
-    """Owns a frame of the kernel, and what the kernel reads through it."""
+    """Owns a frame of the kernel, and what the kernel reads through it.
 
-    def __init__(self, frame: ctypes.c_void_p, *alive: Any) -> None:
-        self.frame, self._alive = frame, alive
+    Made before the frame: an interrupt that arrives with the frame must find it owned. `lock`: a frame computes one
+    backward pass at a time.
+    """
+
+    _release: Any = None  # stays None where there is no kernel to load
+
+    def __init__(self, *alive: Any) -> None:
+        self.frame, self._alive = ctypes.c_void_p(), alive
+        self.lock = threading.Lock()
         self._release = native.library().splash_release  # at exit the module may be gone first
 
     def __del__(self) -> None:
-        self._release(self.frame)
+        if self._release is not None:
+            self._release(self.frame)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frozen:
     """Gaussians that never change, projected, sorted and rendered for one camera; made by `freeze`.
 
@@ -117,11 +126,10 @@ class Rendering:
             outer.append(grad)
         gradients = add_to or tuple(None if a is None else memory.empty(a.shape) for a in self.gaussians)
         into = native.Gradients(int(add_to is not None), *map(_address, gradients))
-        library = native.library()
-        _raise_for(
-            library.splash_backward(self.handle.frame, *map(_address, outer), _thread_count(), ctypes.byref(into)),
-            self.gaussians,
-        )
+        backward = native.library().splash_backward
+        with self.handle.lock:
+            status = backward(self.handle.frame, *map(_address, outer), _thread_count(), ctypes.byref(into))
+        _raise_for(status, self.gaussians)
         return gradients  # type: ignore[return-value]
 
     def counts(self) -> dict[str, int]:
@@ -132,41 +140,50 @@ class Rendering:
 
 
 def _raise_for(status: int, gaussians: tuple[Floats, Floats, Floats, Floats | None]) -> None:
+    if status == native.DONE:
+        return
     if status == native.NOT_FINITE:
         arguments.check_finite(*gaussians)
-    elif status == native.OUT_OF_MEMORY:
+        raise ValueError("the Gaussians held values that are not finite, and were changed since")
+    if status == native.OUT_OF_MEMORY:
         raise MemoryError("the renderer is out of memory: fewer Gaussians, smaller ones or smaller images need less")
-    elif status == native.TOO_LARGE:
+    if status == native.TOO_LARGE:
         raise ValueError(f"means has {len(gaussians[0])} rows; the renderer takes fewer than 2^31")
+    raise RuntimeError(f"the renderer's kernel answered {status}")
 
 
 def _gaussians(
     means: Any, factors: Any, opacities: Any, colors: Any
 ) -> tuple[tuple[Floats, Floats, Floats, Floats | None], native.Gaussians]:
-    channels = arguments.check_shapes(means, factors, opacities, colors)
     arrays = (
         arguments.floats(means, "means"),
         arguments.floats(factors, "factors"),
         arguments.floats(opacities, "opacities"),
         None if colors is None else arguments.floats(colors, "colors"),
     )
+    channels = arguments.check_shapes(*arrays)
     return arrays, native.Gaussians(len(arrays[0]), channels, *map(_address, arrays))
 
 
 def freeze(means: Any, factors: Any, opacities: Any, colors: Any, camera: Camera, *, depth: bool = False) -> Frozen:
-    """See `splashbench.render.freeze`."""
+    """Prepare Gaussians that never change for one camera: projected, sorted and drawn once.
+
+    The arguments are those of `rasterize` (tensors or arrays; values are copied). Give the result to `rasterize` as
+    `frozen`, with as many channels, and the same `depth`. It holds an image of this camera's size (see `bytes`).
+    Raises ValueError or TypeError naming the argument.
+    """
     arguments.check_camera(camera)
+    depth = arguments.check_flag(depth, "depth")
     arrays, gaussians = _gaussians(means, factors, opacities, colors)
     # The arrays are kept beyond this call, so later changes by the caller must not reach them.
     arrays = tuple(None if a is None else a.copy() for a in arrays)  # type: ignore[assignment]
     gaussians = native.Gaussians(len(arrays[0]), gaussians.channels, *map(_address, arrays))
-    frame = ctypes.c_void_p()
-    library = native.library()
-    status = library.splash_freeze(
-        ctypes.byref(_camera(camera)), ctypes.byref(gaussians), int(depth), _thread_count(), ctypes.byref(frame)
+    handle = _Handle(arrays)
+    status = native.library().splash_freeze(
+        ctypes.byref(_camera(camera)), ctypes.byref(gaussians), int(depth), _thread_count(), ctypes.byref(handle.frame)
     )
     _raise_for(status, arrays)
-    return Frozen(camera, arrays, depth, _Handle(frame, arrays))
+    return Frozen(camera, arrays, depth, handle)
 
 
 def forward(
@@ -181,23 +198,27 @@ def forward(
     frozen: Frozen | None = None,
     depth: bool = False,
     compact: bool = False,
+    for_backward: bool = False,
 ) -> Rendering:
-    """Render for one camera; the arguments are those of `splashbench.render.rasterize`."""
+    """Render for one camera; the arguments are those of `splashbench.render.rasterize`.
+
+    for_backward: keep a copy of the background. Without it, neither may it change before the rendering's `backward`.
+    """
     arguments.check_camera(camera)
     arrays, gaussians = _gaussians(means, factors, opacities, colors)
     channels = gaussians.channels + int(depth)
     arguments.check_frozen(frozen, camera, gaussians.channels, depth)
     behind = arguments.check_background(background, camera, gaussians.channels)
+    if behind is not None and for_backward:
+        behind = behind.copy()  # read again by the backward pass, which the caller's later changes must not reach
     if behind is not None and depth:
         behind = np.concatenate([behind, np.zeros((*behind.shape[:-1], 1), np.float32)], axis=-1)
     tile_modes: Modes | None = arguments.check_modes(modes, camera)
-    counters.record(len(arrays[0]) + (0 if frozen is None else len(frozen)), f"cpu ({native.variant()})")
-
     shape: tuple[int, ...] = (camera.height, camera.width)
     color_shape = (*shape, channels)
     if compact:
-        grid = (-(-camera.height // TILE_HEIGHT), -(-camera.width // TILE_WIDTH))
-        kept = grid[0] * grid[1] if tile_modes is None else int(np.count_nonzero(tile_modes != SKIP))
+        rows, columns = tile_grid(camera.width, camera.height)
+        kept = rows * columns if tile_modes is None else int(np.count_nonzero(tile_modes != SKIP))
         shape = (kept, TILE_HEIGHT, TILE_WIDTH)
         color_shape = (kept, channels, TILE_HEIGHT, TILE_WIDTH)
     color, opacity = memory.empty(color_shape), memory.empty(shape)
@@ -210,15 +231,15 @@ def forward(
         _address(color),
         _address(opacity),
     )
-    frame = ctypes.c_void_p()
-    library = native.library()
-    status = library.splash_forward(
+    handle = _Handle(arrays, behind, frozen)
+    status = native.library().splash_forward(
         ctypes.byref(_camera(camera)),
         ctypes.byref(gaussians),
         ctypes.byref(output),
         None if frozen is None else frozen.handle.frame,
         _thread_count(),
-        ctypes.byref(frame),
+        ctypes.byref(handle.frame),
     )
     _raise_for(status, arrays)
-    return Rendering(color, opacity, _Handle(frame, arrays, behind, frozen), arrays)
+    counters.record(len(arrays[0]) + (0 if frozen is None else len(frozen)), f"cpu ({native.variant()})")
+    return Rendering(color, opacity, handle, arrays)

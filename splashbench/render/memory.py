@@ -7,6 +7,7 @@ each cleared first. An array handed out is a view of a buffer kept here; a buffe
 from __future__ import annotations
 
 import math
+import os
 import sys
 import threading
 
@@ -20,6 +21,15 @@ KEPT_BYTES = 1 << 28
 _lock = threading.Lock()
 _buffers: list[NDArray[np.float32]] = []  # least recently handed out first
 
+
+def _after_fork() -> None:
+    """The child's lock may be held by a thread that it does not have."""
+    global _lock
+    _lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 # What getrefcount says of an array that nothing but a list holds.
 _probe = [np.empty(1, np.float32)]

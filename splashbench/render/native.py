@@ -1,7 +1,7 @@
 """The compiled kernel: finds the library for this processor, and states its C interface (kernel/api.h) to ctypes.
 
-The build makes a library for each kind of processor (kernel/libsplash_<variant>.so); the widest one that this processor
-runs is loaded. SPLASHBENCH_SIMD=<variant> asks for another, SPLASHBENCH_KERNEL=<path> for a library built elsewhere.
+The build makes a library for each kind of processor (kernel/libsplash_<variant>.so); the best one for this processor
+is loaded. SPLASHBENCH_SIMD=<variant> asks for another, SPLASHBENCH_KERNEL=<path> for a library built elsewhere.
 Variants round differently in the last digits, so a run's record names the one it used.
 """
 
@@ -107,6 +107,7 @@ def _open(path: Path) -> ctypes.CDLL:
         "splash_trim": (None, ()),
         "splash_variant": (c_char_p, ()),
         "splash_best_variant": (c_char_p, ()),
+        "splash_runs": (c_int32, (c_char_p,)),
         "splash_tile_width": (c_int32, ()),
         "splash_tile_height": (c_int32, ()),
         "splash_constants": (None, (c_double * 6,)),
@@ -122,12 +123,29 @@ def built_variants() -> list[str]:
     return sorted(path.stem.removeprefix("libsplash_") for path in _FOLDER.glob(f"libsplash_*{_SUFFIX}"))
 
 
-def open_variant(variant: str) -> ctypes.CDLL:
-    """The library of one variant. Raises SplashbenchError where there is none, or it cannot be loaded."""
+def _plain() -> ctypes.CDLL:
+    """The variant that every processor of its kind runs, and that knows about the others."""
+    return _open(_path("neon" if "neon" in built_variants() else "baseline"))
+
+
+def _path(variant: str) -> Path:
     path = _FOLDER / f"libsplash_{variant}{_SUFFIX}"
     if not path.exists():
         built = ", ".join(built_variants()) or "none"
         raise SplashbenchError(f"{path}: there is no such kernel of the renderer (built: {built}); {_REBUILD}")
+    return path
+
+
+def runs(variant: str) -> bool:
+    """Whether this processor runs a variant."""
+    return bool(_plain().splash_runs(variant.encode()))
+
+
+def open_variant(variant: str) -> ctypes.CDLL:
+    """The library of one variant. Raises SplashbenchError where there is none, or this processor does not run it."""
+    path = _path(variant)
+    if not runs(variant):
+        raise SplashbenchError(f"{path}: this processor does not run it; unset SPLASHBENCH_SIMD")
     return _open(path)
 
 
@@ -140,11 +158,8 @@ def library() -> ctypes.CDLL:
     wanted = os.environ.get("SPLASHBENCH_SIMD", "")
     if wanted:
         return open_variant(wanted)
-    built = built_variants()
-    # Every processor of its kind runs this one, which then knows the best for this processor.
-    plain = open_variant("neon" if "neon" in built else "baseline")
-    best = plain.splash_best_variant().decode()
-    return plain if best == variant(plain) or best not in built else open_variant(best)
+    best = _plain().splash_best_variant().decode()
+    return open_variant(best) if best in built_variants() else _plain()
 
 
 def variant(of: ctypes.CDLL | None = None) -> str:

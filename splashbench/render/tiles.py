@@ -25,10 +25,10 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
     return -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
 
 
-def _any_in_tile(pixels: NDArray) -> NDArray[np.bool_]:
+def _any_in_tile(pixels: NDArray, name: str) -> NDArray[np.bool_]:
     pixels = np.asarray(pixels)
     if pixels.dtype != bool or pixels.ndim != 2:
-        raise TypeError(f"a pixel mask is bool [H, W], not {pixels.dtype} {list(pixels.shape)}")
+        raise TypeError(f"{name} is {pixels.dtype} {list(pixels.shape)}, not a mask of pixels, bool [H, W]")
     rows, columns = tile_grid(pixels.shape[1], pixels.shape[0])
     padded = np.zeros((rows * TILE_HEIGHT, columns * TILE_WIDTH), dtype=bool)
     padded[: pixels.shape[0], : pixels.shape[1]] = pixels
@@ -41,11 +41,11 @@ def tile_modes(color: NDArray[np.bool_], opacity: NDArray[np.bool_] | None = Non
     COLOR where a tile holds a pixel of `color`, else OPACITY where it holds one of `opacity`, else SKIP. A loss that
     compares colours within a mask and opacity everywhere takes tile_modes(mask, np.ones_like(mask)).
     """
-    modes = np.where(_any_in_tile(color), COLOR, SKIP).astype(np.uint8)
+    modes = np.where(_any_in_tile(color, "color"), COLOR, SKIP).astype(np.uint8)
     if opacity is not None:
         if np.shape(opacity) != np.shape(color):
             raise ValueError(f"opacity is {list(np.shape(opacity))}, color {list(np.shape(color))}")
-        modes[(modes == SKIP) & _any_in_tile(opacity)] = OPACITY
+        modes[(modes == SKIP) & _any_in_tile(opacity, "opacity")] = OPACITY
     return modes
 
 
@@ -55,6 +55,8 @@ def to_tiles(image: NDArray[Number], modes: Modes) -> NDArray[Number]:
     K is the number of tiles whose mode is not SKIP. Pixels beyond the image are 0.
     """
     image = np.asarray(image)
+    if image.ndim not in (2, 3):
+        raise ValueError(f"image is {list(image.shape)}, not [H, W, C] or [H, W]")
     height, width = image.shape[:2]
     grid = tile_grid(width, height)
     if np.shape(modes) != grid:
@@ -72,6 +74,8 @@ def from_tiles(tiles: NDArray[Number], modes: Modes, height: int, width: int) ->
     tiles = np.asarray(tiles)
     grid = tile_grid(width, height)
     kept = np.asarray(modes) != SKIP
+    if tiles.ndim not in (3, 4) or tiles.shape[-2:] != (TILE_HEIGHT, TILE_WIDTH):
+        raise ValueError(f"tiles is {list(tiles.shape)}, not [K, C, {TILE_HEIGHT}, {TILE_WIDTH}] or without C")
     if kept.shape != grid or len(tiles) != kept.sum():
         raise ValueError(
             f"{len(tiles)} tiles and modes {list(kept.shape)} with {kept.sum()} tiles do not make an image of "

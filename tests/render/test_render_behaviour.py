@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from splashbench.errors import SplashbenchError
-from splashbench.render import counters, cpu, rasterize, rasterize_arrays
+from splashbench.render import COLOR, SKIP, counters, cpu, freeze, rasterize, rasterize_arrays
 from splashbench.scene.camera import Camera
 
 NAMES = ("means", "factors", "opacities", "colors")
@@ -67,6 +67,18 @@ def test_gaussians_behind_the_camera_or_beside_the_image_are_not_drawn(camera, m
     assert (opacity == 0).all()
     (color.sum() + opacity.sum()).backward()
     assert all((tensor.grad == 0).all() for tensor in tensors)
+
+
+@pytest.mark.parametrize(("focal", "center"), [(1e9, 85.0), (1.0, 1e9), (1e9, -1e9)])
+def test_extreme_cameras_with_skipped_tiles_do_no_harm(focal, center):
+    camera = Camera("x", 150, 70, np.array([[focal, 0, center], [0, focal, 35.0], [0, 0, 1]]), np.eye(4))
+    modes = np.full((3, 3), COLOR, np.uint8)
+    modes[0, 0] = SKIP
+    arrays = scatter(200)
+    arrays[1][::2] = 0
+    color, opacity = rasterize_arrays(*arrays, camera, modes=modes)
+    assert np.isfinite(color).all()
+    assert (opacity[:32, :64] == 0).all()
 
 
 @pytest.mark.parametrize("scale", [1e15, 1e30, 3e38])
@@ -158,6 +170,29 @@ def test_other_wrong_arguments_are_refused_by_name(camera):
         rasterize(*tensors, "1")
     with pytest.raises(ValueError, match="backend is 'gpu', not one of auto, cpu, cuda"):
         rasterize(*tensors, camera, backend="gpu")
+    for name in ("depth", "compact"):
+        for value in (-1, 2, None, "yes"):
+            with pytest.raises(TypeError, match=f"{name} is .*, not True or False"):
+                rasterize_arrays(*arrays, camera, **{name: value})
+    with pytest.raises(TypeError, match="depth is 2"):
+        freeze(*arrays, camera, depth=2)
+    for frozen in (True, "x", object()):
+        with pytest.raises(TypeError, match=r"frozen is a .*, not what splashbench"):
+            rasterize_arrays(*arrays, camera, frozen=frozen)
+    with pytest.raises(ValueError, match="cameras is empty"):
+        rasterize(*tensors, [])
+    with pytest.raises(TypeError, match="means holds no dense values"):
+        rasterize(tensors[0].to("meta"), *tensors[1:], camera)
+    with pytest.raises(TypeError, match="modes cannot be read"):
+        rasterize_arrays(*arrays, camera, modes=[[1], [1, 1]])
+    with pytest.raises(ValueError, match="background holds values that are not finite"):
+        rasterize_arrays(*arrays, camera, background=np.array([np.inf, -np.inf, 0]))
+    huge = Camera("8", 2**32 + 64, 1, np.array([[9.0, 0, 4], [0, 9, 0.5], [0, 0, 1]]), np.eye(4))
+    with pytest.raises(ValueError, match="camera 8 is"):
+        rasterize_arrays(*arrays[:3], None, huge)
+    far = Camera("7", 8, 8, np.array([[1e20, 0, 4], [0, 9, 4], [0, 0, 1]]), np.eye(4))
+    with pytest.raises(ValueError, match="camera 7 has entries above"):
+        rasterize_arrays(*arrays, far)
     skewed = Camera("9", 8, 8, np.array([[9.0, 0.5, 4], [0, 9, 4], [0, 0, 1]]), np.eye(4))
     with pytest.raises(ValueError, match="camera 9 is not a pinhole"):
         rasterize_arrays(*arrays, skewed)
@@ -267,6 +302,40 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed(camera):
         tensors[0].add_(1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         color.sum().backward()
+
+
+@pytest.mark.parametrize("shape", [(3,), (90, 170, 3)])
+def test_a_background_changed_in_place_leaves_the_gradients_alone(camera, shape):
+    gradients = []
+    for change in (False, True):
+        tensors, background = tensors_of(scatter(200)), torch.rand(shape, generator=torch.Generator().manual_seed(0))
+        color, _ = rasterize(*tensors, camera, background=background)
+        if change:
+            background.zero_()
+        color.square().sum().backward()
+        gradients.append([t.grad for t in tensors])
+    for plain, changed in zip(*gradients):
+        assert torch.equal(plain, changed)
+
+
+def test_backward_passes_of_one_rendering_at_once(camera):
+    arrays = scatter(4000)
+    rendering = cpu.forward(*arrays, camera)
+    weights = [np.random.default_rng(i).normal(size=(90, 170, 3)).astype(np.float32) for i in range(2)]
+    expected = [rendering.backward(weight, None)[1].copy() for weight in weights]
+    wrong: list[int] = []
+
+    def work(which: int) -> None:
+        for _ in range(20):
+            if not np.array_equal(rendering.backward(weights[which], None)[1], expected[which]):
+                wrong.append(which)
+
+    workers = [threading.Thread(target=work, args=(which,)) for which in range(2)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert wrong == []
 
 
 def test_the_backward_pass_can_be_repeated(camera):

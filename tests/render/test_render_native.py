@@ -34,16 +34,23 @@ def run(**environment: str) -> subprocess.CompletedProcess:
 
 def runnable() -> list[str]:
     """The built variants that this processor runs."""
-    built = native.built_variants()
-    best = native.open_variant("neon" if "neon" in built else "baseline").splash_best_variant().decode()
-    order = ["baseline", "avx2", "avx512"]
-    return [v for v in built if v == best or (v in order and best in order and order.index(v) <= order.index(best))]
+    return [variant for variant in native.built_variants() if native.runs(variant)]
 
 
 def test_the_best_variant_for_this_processor_is_used():
     if os.environ.get("SPLASHBENCH_KERNEL") or os.environ.get("SPLASHBENCH_SIMD"):
         pytest.skip("the environment asks for another kernel")
-    assert native.variant() == runnable()[-1] or native.variant() == native.library().splash_best_variant().decode()
+    assert native.variant() == ("avx2" if "avx2" in runnable() else native.built_variants()[0])
+
+
+def test_a_variant_that_this_processor_does_not_run_is_one_line(monkeypatch):
+    others = [variant for variant in native.built_variants() if variant not in runnable()]
+    if not others:
+        pytest.skip("this processor runs every variant that was built")
+    monkeypatch.delenv("SPLASHBENCH_KERNEL", raising=False)
+    done = run(SPLASHBENCH_SIMD=others[0])
+    assert done.returncode == 1
+    assert "this processor does not run it" in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("variant", ["baseline", "avx2", "avx512", "neon"])

@@ -117,6 +117,10 @@ def test_images_survive_being_cut_into_tiles(shape):
         from_tiles(tiles[1:], modes, 110, 200)
     with pytest.raises(ValueError, match=r"modes are \[4, 3\]"):
         to_tiles(image, modes[:, 1:])
+    with pytest.raises(ValueError, match=r"tiles is \[14, 1, 1\]"):
+        from_tiles(np.zeros((14, 1, 1)), modes, 110, 200)
+    with pytest.raises(ValueError, match=r"image is \[5\]"):
+        to_tiles(np.zeros(5), modes)
 
 
 @pytest.mark.parametrize("channels", [3, 5])

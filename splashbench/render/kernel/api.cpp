@@ -1,4 +1,4 @@
-// The C interface: checks nothing (../native.py does), turns exceptions into a status, and keeps frames for later calls.
+// The C interface: checks nothing (../arguments.py does), turns exceptions into a status, and keeps frames for later calls.
 
 #include "api.h"
 
@@ -6,6 +6,9 @@
 #include <mutex>
 #include <new>
 #include <vector>
+#ifndef _WIN32
+#include <pthread.h>
+#endif
 
 #include "frame.h"
 #include "threads.h"
@@ -19,13 +22,29 @@ namespace {
 
 // Frames given back, most recent last: their buffers fit the next call.
 constexpr size_t KEPT = 4;
+constexpr int64_t KEPT_BYTES = int64_t(1) << 28;  // of each; larger ones are freed
 std::mutex kept_mutex;
 std::vector<SplashFrame*>& kept() {
-    static std::vector<SplashFrame*>* const frames = new std::vector<SplashFrame*>;
+    static std::vector<SplashFrame*>* const frames = [] {
+        auto* const made = new std::vector<SplashFrame*>;
+        made->reserve(KEPT);
+        return made;
+    }();
     return *frames;
 }
 
+// A child that was forked while another thread held the lock would wait for ever.
+void guard_forks() {
+#ifndef _WIN32
+    static std::once_flag once;
+    std::call_once(once, [] {
+        pthread_atfork([] { kept_mutex.lock(); }, [] { kept_mutex.unlock(); }, [] { kept_mutex.unlock(); });
+    });
+#endif
+}
+
 SplashFrame* take_frame() {
+    guard_forks();
     {
         std::lock_guard<std::mutex> lock(kept_mutex);
         if (!kept().empty()) {
@@ -123,7 +142,7 @@ int splash_forward(const SplashCamera* camera, const SplashGaussians* gaussians,
         splash::blend(frame, output->color, output->opacity);
         *result = held;
         return SPLASH_DONE;
-    } catch (const std::bad_alloc&) {
+    } catch (...) {  // nothing but std::bad_alloc is thrown
         delete held;
         return SPLASH_OUT_OF_MEMORY;
     }
@@ -134,6 +153,7 @@ int splash_freeze(const SplashCamera* camera, const SplashGaussians* gaussians, 
     SplashFrame* held = nullptr;
     try {
         held = new SplashFrame();
+        held->frame.frozen_itself = true;
         const int status = splash::prepare(held->frame, *camera, *gaussians, depth != 0, nullptr, nullptr, threads);
         if (status != SPLASH_DONE) {
             delete held;
@@ -142,7 +162,7 @@ int splash_freeze(const SplashCamera* camera, const SplashGaussians* gaussians, 
         splash::bake(held->frame);
         *result = held;
         return SPLASH_DONE;
-    } catch (const std::bad_alloc&) {
+    } catch (...) {  // nothing but std::bad_alloc is thrown
         delete held;
         return SPLASH_OUT_OF_MEMORY;
     }
@@ -154,14 +174,14 @@ int splash_backward(SplashFrame* held, const float* grad_color, const float* gra
         held->frame.threads = splash::workers(threads);
         splash::backward(held->frame, grad_color, grad_opacity, *gradients);
         return SPLASH_DONE;
-    } catch (const std::bad_alloc&) {
+    } catch (...) {  // nothing but std::bad_alloc is thrown
         return SPLASH_OUT_OF_MEMORY;
     }
 }
 
 void splash_release(SplashFrame* held) {
     if (held == nullptr) return;
-    {
+    if (!held->frame.frozen_itself && splash_frame_bytes(held) <= splash::KEPT_BYTES) {
         std::lock_guard<std::mutex> lock(splash::kept_mutex);
         if (splash::kept().size() < splash::KEPT) {
             splash::kept().push_back(held);

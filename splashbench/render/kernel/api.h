@@ -75,12 +75,13 @@ SPLASH_API int64_t splash_frame_bytes(const SplashFrame*);
 // Counts of a frame: Gaussians drawn, (Gaussian, tile) pairs, tiles with work.
 SPLASH_API void splash_frame_counts(const SplashFrame*, int64_t counts[3]);
 
-// Frees the memory kept for later calls.
+// Frees the frames kept for later calls (each thread keeps its scratch of one tile).
 SPLASH_API void splash_trim(void);
 
 SPLASH_API int splash_abi_version(void);
 SPLASH_API const char* splash_variant(void);       // of this library
-SPLASH_API const char* splash_best_variant(void);  // that this processor runs
+SPLASH_API const char* splash_best_variant(void);  // for this processor
+SPLASH_API int splash_runs(const char* variant);   // 1: this processor runs it
 SPLASH_API int splash_tile_width(void);
 SPLASH_API int splash_tile_height(void);
 SPLASH_API void splash_constants(double values[6]);  // in the order of constants.h

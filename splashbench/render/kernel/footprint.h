@@ -37,19 +37,17 @@ struct Footprint {
     alignas(64) int32_t last[TILE_HEIGHT + LANES];
 };
 
-inline float within(float value, float low, float high) { return value < low ? low : value > high ? high : value; }
-
 inline void find_footprint(const Splat& s, const TileFrame& tile, Footprint& f) {
     const float y = static_cast<float>(s.y - 0.5 - tile.y), x = static_cast<float>(s.x - 0.5 - tile.x);
-    f.top = static_cast<int>(std::ceil(within(y - s.half_height - SLACK, 0.0f, TILE_HEIGHT)));
-    f.bottom = static_cast<int>(std::floor(within(y + s.half_height + SLACK, -1.0f, tile.rows - 1)));
+    f.top = static_cast<int>(std::ceil(clamped(y - s.half_height - SLACK, 0.0f, TILE_HEIGHT)));
+    f.bottom = static_cast<int>(std::floor(clamped(y + s.half_height + SLACK, -1.0f, tile.rows - 1)));
     const Floats offsets = ramp(), columns = all(static_cast<float>(tile.columns));
     const Ints numbers = __builtin_convertvector(offsets, Ints);
     for (int row = f.top & ~(LANES - 1); row <= f.bottom; row += LANES) {
         const Floats dy = offsets + (row - y);
         const Floats peak = s.log2_opacity - s.fall * dy * dy;
         const Floats middle = x + s.slope * dy;
-        const Floats squared = max((peak - (LOG2_MIN_ALPHA - 2e-6f)) * (s.per_square_root * 1.00001f), all(0.0f));
+        const Floats squared = max((peak - (LOG2_MIN_ALPHA - 2e-6f)) * (s.per_square * 1.00001f), all(0.0f));
         const Floats half = square_root(squared) + SLACK;
         const Floats left = min(max(middle - half, all(0.0f)), columns);
         const Floats right = min(max(middle + half, all(-1.0f)), columns - 1.0f);

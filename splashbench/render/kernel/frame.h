@@ -20,7 +20,7 @@ struct alignas(64) Splat {
     double x, y;                    // centre, px: in float a wide image's last columns would have but 13 bits of a pixel
     float root, slope, fall;        // 1/px, px per row, 1/px^2
     float log2_opacity;
-    float per_square_root;          // 1 / root^2
+    float per_square;               // 1 / root^2
     float half_width, half_height;  // the ellipse alpha = MIN_ALPHA reaches this far from the centre, px
     float depth;                    // along the optical axis, scene units
     float color[3];
@@ -57,6 +57,7 @@ struct Frame {
     Camera camera;
     int tile_columns, tile_rows, tiles;
     int threads;
+    bool frozen_itself = false;  // made by splash_freeze: not kept for later calls
 
     // The caller's, alive until the frame is released.
     SplashGaussians gaussians;
@@ -73,7 +74,7 @@ struct Frame {
     int64_t drawn;
     Buffer<Splat> projected;      // [count], by id
     Buffer<uint32_t> keys;        // [count], NOT_DRAWN where left out
-    Buffer<int32_t> ranks;        // [count], id to rank in depth, -1 where left out
+    Buffer<int32_t> ranks;        // [count], id to rank in depth; nothing where left out
     Buffer<SortItem> items, other_items;
     Buffer<int64_t> histograms;
     Buffer<Splat> splats;         // [drawn], by depth
@@ -108,6 +109,8 @@ struct Frame {
     }
     bool empty(int tile) const { return tile_starts[tile] == tile_starts[tile + 1]; }
 };
+
+inline float clamped(float value, float low, float high) { return value < low ? low : value > high ? high : value; }
 
 constexpr uint32_t NOT_DRAWN = 0xffffffffu;
 

@@ -1,6 +1,8 @@
 // Which variant of the kernel this processor runs. Asked by hand, because the compilers' own question needs a run-time
 // library that not all of them bring.
 
+#include <cstring>
+
 #include "api.h"
 
 #if defined(__x86_64__) || defined(_M_X64)
@@ -22,10 +24,28 @@ bool runs_x86_64_v3() {
     return __get_cpuid(0x80000001, &a, &b, &c, &d) && (c & bit_LZCNT) != 0;
 }
 
+// And those of x86-64-v4 (the common parts of AVX-512).
+bool runs_x86_64_v4() {
+    unsigned a, b, c, d, saved, high;
+    if (!runs_x86_64_v3()) return false;
+    __asm__("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+    const unsigned all_registers = 0xe6;
+    if ((saved & all_registers) != all_registers || !__get_cpuid_count(7, 0, &a, &b, &c, &d)) return false;
+    const unsigned wanted = bit_AVX512F | bit_AVX512DQ | bit_AVX512CD | bit_AVX512BW | bit_AVX512VL;
+    return (b & wanted) == wanted;
+}
+
 }  // namespace
+
+extern "C" int splash_runs(const char* variant) {
+    if (std::strcmp(variant, "avx512") == 0) return runs_x86_64_v4();
+    if (std::strcmp(variant, "avx2") == 0) return runs_x86_64_v3();
+    return std::strcmp(variant, "baseline") == 0;
+}
 
 // The avx512 variant is there for those who ask for it: its gain has not been measured.
 extern "C" const char* splash_best_variant(void) { return runs_x86_64_v3() ? "avx2" : "baseline"; }
 #else
+extern "C" int splash_runs(const char* variant) { return std::strcmp(variant, "neon") == 0; }
 extern "C" const char* splash_best_variant(void) { return "neon"; }
 #endif

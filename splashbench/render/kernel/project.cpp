@@ -54,7 +54,7 @@ bool project_one(const Frame& frame, int64_t i, Splat& splat) {
     if (!(std::fabs(splat.x) < LARGEST && std::fabs(splat.y) < LARGEST)) return false;
     if (frame.skips && opacity <= 1.0f) {
         const float reach = farthest_reach(camera, static_cast<float>(per_z), g.factors + 9 * i);
-        if (tiles_active(frame, box_range(frame, splat.x, splat.y, reach, reach)) == 0) return false;
+        if (reach < LARGEST && tiles_active(frame, box_range(frame, splat.x, splat.y, reach, reach)) == 0) return false;
     }
     const Linearised l = linearise(camera, at, g.factors + 9 * i);
     const float pp = dot(l.p, l.p), pq = dot(l.p, l.q), qq = dot(l.q, l.q);
@@ -64,13 +64,13 @@ bool project_one(const Frame& frame, int64_t i, Splat& splat) {
     const float determinant = dot(normal, normal) + BLUR_VARIANCE * (pp + qq) + BLUR_VARIANCE * BLUR_VARIANCE;
     splat.log2_opacity = std::log2(opacity);
     // On the ellipse's edge d^T inverse(covariance) d = reach.
-    const float reach = 2.0f * LN_2 * (splat.log2_opacity - LOG2_MIN_ALPHA);
+    const float reach = 2.0f * LN_2 * std::max(0.0f, splat.log2_opacity - LOG2_MIN_ALPHA);
     splat.half_width = std::sqrt(reach * xx);
     splat.half_height = std::sqrt(reach * yy);
     if (tiles_active(frame, tile_range(frame, splat)) == 0) return false;
     const float square = 0.5f * LOG2_E * yy / determinant;
     splat.root = std::sqrt(square);
-    splat.per_square_root = 1.0f / square;
+    splat.per_square = 1.0f / square;
     splat.slope = pq / yy;
     splat.fall = 0.5f * LOG2_E / yy;
     splat.depth = l.z;

@@ -40,8 +40,6 @@ inline Point in_camera(const Camera& camera, const float* mean) {
             m[8] * x + m[9] * y + m[10] * z + m[11]};
 }
 
-inline float clamped(float value, float low, float high) { return value < low ? low : value > high ? high : value; }
-
 inline Linearised linearise(const Camera& camera, Point at, const float* factor) {
     Linearised l;
     l.x = static_cast<float>(at.x);

@@ -9,7 +9,7 @@
 
 namespace splash {
 
-// Rounding must not lose a pixel on the ellipse's edge; alpha is tested again at each pixel.
+// Rounding should not lose a pixel on the ellipse's edge; alpha is tested again at each pixel.
 constexpr float SLACK = 1e-3f;
 
 struct TileRange {
@@ -18,7 +18,8 @@ struct TileRange {
 
 // The tile along one axis that holds a pixel, the nearest one for pixels beyond the image.
 inline int tile_index(float pixel, float size, int last) {
-    return static_cast<int>(std::min(std::max(pixel / size, 0.0f), static_cast<float>(last)));
+    // In this order NaN becomes 0.
+    return static_cast<int>(std::min(std::max(0.0f, pixel / size), static_cast<float>(last)));
 }
 
 // The tiles that hold a pixel of the box at (x, y) px, that far from it to either side. Written without branches: whether a
