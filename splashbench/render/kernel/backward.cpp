@@ -257,11 +257,13 @@ void gaussian_gradient(const Frame& frame, int64_t i, const Splat& s, const floa
     }
 }
 
-void clear(int64_t i, int channels, const SplashGradients& out) {
-    std::memset(out.means + 3 * i, 0, 3 * sizeof(float));
-    std::memset(out.factors + 9 * i, 0, 9 * sizeof(float));
-    out.opacities[i] = 0.0f;
-    if (channels > 0) std::memset(out.colors + i * channels, 0, channels * sizeof(float));
+// Zero gradients for the Gaussians [begin, end).
+void clear(int64_t begin, int64_t end, int channels, const SplashGradients& out) {
+    const size_t bytes = sizeof(float) * (end - begin);
+    std::memset(out.means + 3 * begin, 0, 3 * bytes);
+    std::memset(out.factors + 9 * begin, 0, 9 * bytes);
+    std::memset(out.opacities + begin, 0, bytes);
+    if (channels > 0) std::memset(out.colors + begin * channels, 0, channels * bytes);
 }
 
 }  // namespace
@@ -286,7 +288,10 @@ void backward(Frame& frame, const float* grad_color, const float* grad_opacity, 
         alignas(16) float sums[(MOMENTS + MAX_CHANNELS + 3) / 4 * 4];
         for (int64_t i = begin; i < end; ++i) {
             if (frame.keys[i] == NOT_DRAWN) {
-                if (!gradients.add) clear(i, frame.gaussians.channels, gradients);
+                int64_t past = i + 1;
+                while (past < end && frame.keys[past] == NOT_DRAWN) ++past;
+                if (!gradients.add) clear(i, past, frame.gaussians.channels, gradients);
+                i = past - 1;
                 continue;
             }
             if (i + 8 < end && frame.keys[i + 8] != NOT_DRAWN) {
