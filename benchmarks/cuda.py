@@ -15,7 +15,6 @@ includes the wait for the device. CPU tensors stay on the CPU and CUDA tensors o
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import re
 import statistics
 import subprocess
@@ -26,6 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import render as maker  # benchmarks/render.py, beside this file
 import torch
 
 from splashbench.adapter import hardware
@@ -36,16 +36,6 @@ from splashbench.render import cuda, native, rasterize
 ROOT = Path(__file__).resolve().parents[1]
 TOLERANCE = 1e-3
 WARM_UP = 2
-
-
-def load_module(path: Path) -> ModuleType:
-    """The module in a file that is on no import path."""
-    spec = importlib.util.spec_from_file_location(f"benchmark_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} is no Python module")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def run_tests() -> dict[str, Any]:
@@ -146,7 +136,7 @@ def main() -> int:
     if reason is not None:
         print(f"error: nothing was measured: {reason}", file=sys.stderr)
         return 1
-    maker, reference = (load_module(ROOT / path) for path in ("benchmarks/render.py", "tests/render/reference.py"))
+    reference = maker.reference()
     results: dict[str, Any] = {
         "gpu": torch.cuda.get_device_name(),
         "versions": {"gsplat": cuda.GSPLAT_VERSION, "torch": torch.__version__, "cuda": torch.version.cuda},

@@ -79,9 +79,10 @@ def rasterize_arrays(
     views = _views(cameras, background, modes, frozen, {"depth": depth, "compact": compact})
     arrays = [arguments.floats(value, name) for value, name in zip((means, factors, opacities), arguments.GAUSSIANS)]
     channels = None if colors is None else arguments.floats(colors, "colors")
+    per_camera = _per_camera(channels, cameras, len(views))
     images: tuple[list[Floats], list[Floats]] = ([], [])
     for i, view in enumerate(views):
-        own = channels[i] if channels is not None and _per_camera(channels, cameras, len(views)) else channels
+        own = channels[i] if channels is not None and per_camera else channels
         rendering = cpu.forward(arrays[0], arrays[1], arrays[2], own, **view)
         images[0].append(rendering.color)
         images[1].append(rendering.opacity)

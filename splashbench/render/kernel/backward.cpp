@@ -18,11 +18,9 @@
 namespace splash {
 namespace {
 
-constexpr int AHEAD = 4;
-
 // A tile's pixels, vector by vector: [TILE_VECTORS, 2 + channels, LANES], the transmittance and the rest behind the layer
 // at hand, then the gradients by the colours; together for the reason given in blend.cpp.
-inline int cell_size(int channels) { return (2 + channels) * LANES; }
+inline int gradient_cell_size(int channels) { return (2 + channels) * LANES; }
 
 // The largest stop of each vector and of the tile: layers from there on are invisible in it.
 struct Stops {
@@ -45,7 +43,7 @@ void begin_cells(const Frame& frame, int tile, int channels, const float* grad_c
     const TileFrame at = tile_frame(frame, tile);
     const float* const transmittance = frame.transmittance.data() + static_cast<int64_t>(frame.places[tile]) * TILE_PIXELS;
     const int64_t place = frame.compact ? frame.compact_places[tile] : 0;
-    const int size = cell_size(channels);
+    const int size = gradient_cell_size(channels);
     std::memset(cells, 0, sizeof(float) * TILE_VECTORS * size);
     // Distances between the pixels and between the channels of grad_color.
     const int64_t by_pixel = frame.compact ? 1 : frame.channels, by_channel = frame.compact ? TILE_PIXELS : 1;
@@ -93,7 +91,7 @@ inline void take_back(const Layer& layer, int index, const TileFrame& tile, cons
         Floats row_m = zero, row_mu = zero, row_muu = zero;
         for (int vector = f.first[row]; vector <= f.last[row]; ++vector) {
             if (index >= largest_stops.vector[vector]) continue;
-            float* const cell = cells + vector * cell_size(channels);
+            float* const cell = cells + vector * gradient_cell_size(channels);
             const Floats u = root * load(columns + static_cast<uint32_t>(vector) % VECTORS * LANES) - shift;
             const Floats square = u * u;
             const Floats exponent = peak - square;
@@ -189,16 +187,6 @@ void tile_gradients_any(Frame& frame, const std::vector<Layer>& layers, int tile
     }
 }
 
-struct Worker {
-    std::vector<Layer> layers;
-    Buffer<float> cells;
-};
-
-Worker& this_worker() {
-    static thread_local Worker worker;
-    return worker;
-}
-
 inline void put(float* at, Vector value, bool add) {
     at[0] = add ? at[0] + value.x : value.x;
     at[1] = add ? at[1] + value.y : value.y;
@@ -272,14 +260,14 @@ void backward(Frame& frame, const float* grad_color, const float* grad_opacity, 
     const int stride = slot_size(frame.channels);
     frame.slots.fit(static_cast<size_t>(frame.tile_starts[frame.tiles]) * stride);
     in_pieces(frame.threads, frame.placed, 1, [&](int64_t begin, int64_t end, int) {
-        Worker& worker = this_worker();
-        float* const cells = worker.cells.fit(static_cast<size_t>(TILE_VECTORS) * cell_size(frame.channels));
+        Scratch& scratch = this_threads_scratch();
+        float* const cells = scratch.cells.fit(static_cast<size_t>(TILE_VECTORS) * gradient_cell_size(frame.channels));
         for (int64_t at = begin; at < end; ++at) {
             const int tile = frame.order[at];
             const int channels = frame.modes[tile] == COLOR && grad_color != nullptr ? frame.channels : 0;
-            merged_list(frame, tile, worker.layers);
+            merged_list(frame, tile, scratch.layers);
             begin_cells(frame, tile, channels, grad_color, grad_opacity, cells);
-            tile_gradients_any(frame, worker.layers, tile, channels, cells);
+            tile_gradients_any(frame, scratch.layers, tile, channels, cells);
         }
     });
     constexpr int64_t GRAIN = 1024;

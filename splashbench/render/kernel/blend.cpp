@@ -45,8 +45,6 @@ void merged_list(const Frame& frame, int tile, std::vector<Layer>& layers) {
 
 namespace {
 
-constexpr int AHEAD = 4;  // layers fetched in advance
-
 // Which vectors of a tile still have a pixel that is not exhausted, and how many have.
 struct Alive {
     uint8_t vector[TILE_VECTORS];
@@ -256,17 +254,6 @@ void write_tile(const Frame& frame, int tile, Composited from, float* color, flo
     write_image<-1>(frame, tile, from, color, opacity);
 }
 
-struct Worker {
-    std::vector<Layer> layers;
-    Buffer<float> cells;
-    alignas(64) int32_t stops[TILE_PIXELS];
-};
-
-Worker& this_worker() {
-    static thread_local Worker worker;
-    return worker;
-}
-
 }  // namespace
 
 void blend(Frame& frame, float* color, float* opacity) {
@@ -274,14 +261,14 @@ void blend(Frame& frame, float* color, float* opacity) {
     frame.stops.fit(static_cast<size_t>(frame.placed) * TILE_PIXELS);
     // First the tiles with work, then those that hold the background, or a frozen frame's image, alone.
     in_pieces(frame.threads, frame.placed, 1, [&](int64_t begin, int64_t end, int) {
-        Worker& worker = this_worker();
-        float* const cells = worker.cells.fit(static_cast<size_t>(TILE_VECTORS) * cell_size(frame.channels));
+        Scratch& scratch = this_threads_scratch();
+        float* const cells = scratch.cells.fit(static_cast<size_t>(TILE_VECTORS) * cell_size(frame.channels));
         for (int64_t at = begin; at < end; ++at) {
             const int tile = frame.order[at];
             const int64_t start = static_cast<int64_t>(frame.places[tile]) * TILE_PIXELS;
             const int channels = frame.modes[tile] == COLOR ? frame.channels : 0;
-            merged_list(frame, tile, worker.layers);
-            composite_any(worker.layers, tile_frame(frame, tile), channels, cells, frame.stops.data() + start);
+            merged_list(frame, tile, scratch.layers);
+            composite_any(scratch.layers, tile_frame(frame, tile), channels, cells, frame.stops.data() + start);
             for (int vector = 0; vector < TILE_VECTORS; ++vector) {
                 store(frame.transmittance.data() + start + vector * LANES, load(cells + vector * cell_size(channels)));
             }
@@ -289,7 +276,7 @@ void blend(Frame& frame, float* color, float* opacity) {
         }
     });
     in_pieces(frame.threads, frame.tiles, 16, [&](int64_t begin, int64_t end, int) {
-        Buffer<float>& cells = this_worker().cells;
+        Buffer<float>& cells = this_threads_scratch().cells;
         for (int tile = static_cast<int>(begin); tile < end; ++tile) {
             if (frame.places[tile] >= 0) continue;
             const Frame* const frozen = frame.frozen;
@@ -316,12 +303,13 @@ void bake(Frame& frame) {
     const int64_t size = static_cast<int64_t>(TILE_VECTORS) * cell_size(frame.channels);
     frame.baked.fit(frame.placed * size);
     in_pieces(frame.threads, frame.placed, 1, [&](int64_t begin, int64_t end, int) {
-        Worker& worker = this_worker();
+        Scratch& scratch = this_threads_scratch();
+        alignas(64) int32_t stops[TILE_PIXELS];
         for (int64_t at = begin; at < end; ++at) {
             const int tile = frame.order[at];
-            merged_list(frame, tile, worker.layers);
-            composite_any(worker.layers, tile_frame(frame, tile), frame.channels,
-                          frame.baked.data() + frame.places[tile] * size, worker.stops);
+            merged_list(frame, tile, scratch.layers);
+            composite_any(scratch.layers, tile_frame(frame, tile), frame.channels,
+                          frame.baked.data() + frame.places[tile] * size, stops);
         }
     });
 }

@@ -78,4 +78,17 @@ struct Layer {
 
 void merged_list(const Frame& frame, int tile, std::vector<Layer>& layers);
 
+constexpr int AHEAD = 4;  // layers fetched in advance
+
+// What a thread keeps between tiles.
+struct Scratch {
+    std::vector<Layer> layers;
+    Buffer<float> cells;
+};
+
+inline Scratch& this_threads_scratch() {
+    static thread_local Scratch scratch;
+    return scratch;
+}
+
 }  // namespace splash

@@ -24,7 +24,6 @@ struct alignas(64) Splat {
     float half_width, half_height;  // the ellipse alpha = MIN_ALPHA reaches this far from the centre, px
     float depth;                    // along the optical axis, scene units
     float color[3];
-    int32_t id;                     // row in the caller's arrays
 };
 static_assert(sizeof(Splat) == 64, "one cache line each");
 

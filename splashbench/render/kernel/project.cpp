@@ -74,7 +74,6 @@ bool project_one(const Frame& frame, int64_t i, Splat& splat) {
     splat.slope = pq / yy;
     splat.fall = 0.5f * LOG2_E / yy;
     splat.depth = l.z;
-    splat.id = static_cast<int32_t>(i);
     if (frame.table_colors) {
         splat.color[0] = splat.color[1] = splat.color[2] = 0.0f;
     } else {
