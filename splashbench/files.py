@@ -300,19 +300,26 @@ def write_image(path: Path, image: NDArray[np.uint8], quality: int = 97) -> None
         Image.fromarray(np.ascontiguousarray(image)).save(temporary, **options)
 
 
-def read_npz(path: Path, names: Mapping[str, int], optional: Mapping[str, int] | None = None) -> dict[str, Any]:
+def read_npz(
+    path: Path,
+    names: Mapping[str, int],
+    optional: Mapping[str, int] | None = None,
+    *,
+    max_bytes: int | None = None,
+) -> dict[str, Any]:
     """Read named arrays with the number of dimensions given, without pickles and within limits.
 
     Returns the arrays of `names`, and those of `optional` that are there. Raises SplashbenchError when the file is
     missing, holds too much, or an array is absent, of another rank, not numeric, or not finite.
     """
     path = Path(path)
+    limit = MAX_NPZ_BYTES if max_bytes is None else max_bytes
     try:
         require_plain_file(path)
         with zipfile.ZipFile(path) as archive:
             # The sizes are the archive's claims, but numpy's reader never inflates beyond them.
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_NPZ_BYTES:
-                raise SplashbenchError(f"{path} unpacks to more than {MAX_NPZ_BYTES >> 30} GiB; refused")
+            if sum(entry.file_size for entry in archive.infolist()) > limit:
+                raise SplashbenchError(f"{path} unpacks to more than {limit / 2**30:.3g} GiB; refused")
         with np.load(path, allow_pickle=False) as archive:
             missing = [name for name in names if name not in archive.files]
             if missing:
@@ -334,6 +341,8 @@ def read_npz(path: Path, names: Mapping[str, int], optional: Mapping[str, int] |
     ) as error:
         raise SplashbenchError(f"{path} is not a readable .npz without pickles ({error}); write it again") from None
     for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):  # numpy hands out what is no array as bytes
+            raise SplashbenchError(f"{path}: {name} is no array; write it again")
         if array.ndim != wanted[name]:
             raise SplashbenchError(f"{path}: {name} has {array.ndim} dimensions, not {wanted[name]}; write it again")
         if array.dtype.kind not in "biuf":

@@ -119,6 +119,14 @@ def test_npz_without_pickles_and_with_the_right_ranks(tmp_path: Path) -> None:
         read_npz(path, {"a": 2})
 
 
+def test_what_is_no_array_in_an_archive_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "odd.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"not an array")
+    with pytest.raises(SplashbenchError, match=r"odd\.npz: a is no array"):
+        read_npz(path, {"a": 1})
+
+
 def test_a_zip_bomb_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "bomb.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -1,7 +1,8 @@
-"""Where the anchors start: every training view's pixels lifted to their depth, with their own colour.
+"""Where the anchors start: the scene's sparse points, or every training view's pixels lifted to their depth.
 
-Pixels on a regular grid are lifted to the depth that depth.py gives, and all views' points are merged on voxels as in
-Scaffold-GS, `unique(round(p / voxel))`.
+Sparse points are merged on voxels as in Scaffold-GS, `unique(round(p / voxel)) voxel` (Lu et al. 2024, Eq. 4). Pixels
+on a regular grid are lifted to the depth that depth.py gives, and all views' points are merged likewise, each anchor at
+the mean of its points.
 """
 
 from __future__ import annotations
@@ -16,15 +17,39 @@ from splashbench_methods.scaffold_gs.plate import Plate
 
 # Lifted points per anchor kept: voxels merge what several views see.
 _OVERSAMPLING = 3.0
+# Where pixels are lifted, anchors may grow to this many times the density along an axis.
+_FINEST = 2.0
 
 
 @dataclass(frozen=True)
 class AnchorSeed:
-    """Anchors before fitting: positions [N, 3] scene units, colours [N, 3] in [0, 1], spacing [N] scene units."""
+    """Anchors before fitting: positions [N, 3] scene units, colours [N, 3] in [0, 1], spacing [N] scene units.
+
+    voxel: scene units, the finest voxel on which anchors may grow.
+    """
 
     positions: NDArray[np.float32]
     colors: NDArray[np.float32]
     spacing: NDArray[np.float32]
+    voxel: float
+
+
+def sparse_anchors(points: NDArray[np.float32], count: int) -> AnchorSeed:
+    """At most `count` anchors from sparse points [N, 6 or more] (x y z r g b ...), one per occupied voxel.
+
+    The voxel is the median distance of a point to its nearest neighbour, or as much wider as `count` asks for.
+    """
+    positions, colors = points[:, :3].astype(np.float64), points[:, 3:6].astype(np.float64)
+    distinct = np.unique(positions, axis=0)
+    voxel = float(np.median(cKDTree(distinct).query(distinct, k=2)[0][:, 1])) if len(distinct) > 1 else 1.0
+    while True:
+        cells, owner = np.unique(np.round(positions / voxel), axis=0, return_inverse=True)
+        if len(cells) <= count:
+            break
+        voxel *= 1.25
+    owner = owner.reshape(-1)
+    centers = cells * voxel
+    return _anchor_seed(centers, _means(owner, colors), _spacing(centers), voxel)
 
 
 def seed_anchors(
@@ -66,7 +91,7 @@ def _lift(
         kept, unknown = trusted | ~depth.covered[row, column], ~trusted
     known = None if points is None else interpolated(points[:, :3], camera, uv[unknown])
     inverse[unknown] = guessed(camera, [p.camera for p in plates], int(unknown.sum()), rng) if known is None else known
-    return lift(camera, uv[kept], inverse[kept]), plate.image[cell[kept, 1], cell[kept, 0]]
+    return lift(camera, uv[kept], inverse[kept]), plate.image[cell[kept, 1], cell[kept, 0]] / 255
 
 
 def _merge(positions: NDArray, colors: NDArray, count: int) -> AnchorSeed:
@@ -86,14 +111,28 @@ def _merge(positions: NDArray, colors: NDArray, count: int) -> AnchorSeed:
         occupied = len(np.unique(_cells(contracted, voxel)))
         low, high = (low, voxel) if occupied <= count else (voxel, high)
     _, owner = np.unique(_cells(contracted, high), return_inverse=True)
+    merged, merged_colors = _means(owner, positions), _means(owner, colors)
+    spacing = _spacing(merged)
+    return _anchor_seed(merged, merged_colors, spacing, float(np.median(spacing)) / _FINEST)
+
+
+def _anchor_seed(positions: NDArray, colors: NDArray, spacing: NDArray, voxel: float) -> AnchorSeed:
+    return AnchorSeed(positions.astype(np.float32), colors.astype(np.float32), spacing.astype(np.float32), voxel)
+
+
+def _means(owner: NDArray[np.int64], values: NDArray) -> NDArray[np.float64]:
+    """Means [N, 3] of the rows of `values` [M, 3] that share an `owner` [M] in range(N)."""
     share = np.bincount(owner)[:, None]
-    merged, merged_colors = (
-        np.stack([np.bincount(owner, weights=a[:, c]) for c in range(3)], axis=1) / share for a in (positions, colors)
-    )
-    k = min(4, len(merged))
-    spacing = cKDTree(merged).query(merged, k=k)[0].reshape(len(merged), k)[:, 1:].mean(axis=1) if k > 1 else np.ones(1)
-    spacing = np.clip(spacing, 1e-3 * np.median(spacing) + 1e-9, None)
-    return AnchorSeed(*(a.astype(np.float32) for a in (merged, merged_colors, spacing)))
+    return np.stack([np.bincount(owner, weights=values[:, c]) for c in range(3)], axis=1) / share
+
+
+def _spacing(positions: NDArray) -> NDArray[np.float64]:
+    """Mean distance [N] of each position [N, 3] to its three nearest neighbours; 1 for a single one."""
+    k = min(4, len(positions))
+    if k == 1:
+        return np.ones(1)
+    distance = cKDTree(positions).query(positions, k=k)[0][:, 1:].mean(axis=1)
+    return np.asarray(np.clip(distance, 1e-3 * np.median(distance) + 1e-9, None))
 
 
 def _cells(contracted: NDArray, voxel: float) -> NDArray[np.int64]:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.scaffold_gs.anchors import seed_anchors
+from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench_methods.scaffold_gs.fitting import fit_model, supervised_anchors
-from splashbench_methods.scaffold_gs.model import AnchorModel, to_arrays
-from splashbench_methods.scaffold_gs.plate import Plate, make_plate
+from splashbench_methods.scaffold_gs.model import AnchorModel, Variant, to_arrays
+from splashbench_methods.scaffold_gs.plate import MAX_FRAMES, Plate, make_plate
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
 from splashbench.adapter.contract import Run
@@ -21,6 +21,8 @@ from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, TrainingScene
 
 _FILE = "background.npz"
+# Where Gaussians cover a pixel by less, there is nothing: a tail of one tells no depth.
+_LEAST_OPACITY = 0.05
 
 
 class Background:
@@ -31,35 +33,46 @@ class Background:
         self.far_color = np.asarray(far_color, dtype=np.float32)
 
     def gaussians(self, camera: Camera) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Means [M, 3], factors [M, 3, 3], opacities [M] and colors [M, 3] as seen from `camera`, float32."""
+        """Means [M, 3], factors [M, 3, 3], opacities [M] in (0, 1] and colors [M, 3] seen from `camera`, float32."""
         with torch.no_grad(), one_torch_thread():
-            means, factors, opacities, colors, _ = self.model.decode(camera.center)
-        return means.numpy(), factors.numpy(), opacities.numpy(), colors.numpy()
+            means, factors, opacities, colors, _ = (t.numpy() for t in self.model.decode(camera.center))
+        drawn = opacities > 0
+        return means[drawn], factors[drawn], opacities[drawn], colors[drawn]
 
     def render(self, camera: Camera) -> NDArray[np.float32]:
         """The liquid-free view of `camera`, float32 [H, W, 3] in [0, 1]."""
         rgb, _ = rasterize_arrays(*self.gaussians(camera), camera, background=self.far_color)
         return np.clip(rgb, 0, 1)
 
+    def depth(self, camera: Camera) -> NDArray[np.float32]:
+        """Expected depth along the optical axis of `camera`, float32 [H, W], scene units; inf where nothing lies.
+
+        It is the mean over the Gaussians of a pixel, weighted as their colours are.
+        """
+        means, factors, opacities, _ = self.gaussians(camera)
+        total, opacity = rasterize_arrays(means, factors, opacities, None, camera, depth=True)
+        shown = opacity >= _LEAST_OPACITY
+        depth = np.full(opacity.shape, np.inf, np.float32)
+        depth[shown] = total[..., 0][shown] / opacity[shown]
+        return depth
+
     def save(self, directory: Path) -> None:
         """Write background.npz into `directory` (made where absent)."""
-        fixed = {
-            "children": np.array(self.model.children_per_anchor),
-            "view_dependent_shape": np.array(self.model.view_dependent_shape),
-            "far_color": self.far_color,
-        }
+        variant = {name: np.array(value) for name, value in vars(self.model.variant).items()}
         with atomic_path(Path(directory) / _FILE) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **fixed, **to_arrays(self.model))
+            np.savez(stream, allow_pickle=False, far_color=self.far_color, **variant, **to_arrays(self.model))
 
     @classmethod
     def load(cls, directory: Path) -> Background:
         """Read what `save` wrote."""
         path = Path(directory) / _FILE
-        fixed = read_npz(path, {"children": 0, "view_dependent_shape": 0, "far_color": 1, "positions": 2})
+        fixed = read_npz(
+            path, {"children": 0, "view_dependent_shape": 0, "base_color": 0, "far_color": 1, "positions": 2}
+        )
         n, children = len(fixed["positions"]), int(fixed["children"])
         if not 1 <= children <= 1024:
             raise SplashbenchError(f"{path}: {children} children per anchor make no sense; fit the background again")
-        model = AnchorModel(n, children, bool(fixed["view_dependent_shape"]))
+        model = AnchorModel(n, Variant(children, bool(fixed["view_dependent_shape"]), bool(fixed["base_color"])))
         state = model.state_dict()
         arrays = read_npz(path, {name: tensor.ndim for name, tensor in state.items()})
         try:
@@ -74,22 +87,49 @@ def fit_background(
 ) -> Background:
     """Fit the static scene behind the liquid to the training views' plates. The same seed gives the same background.
 
-    `span` is the part of `run`'s progress that this takes up, for callers with more to do.
+    `span` is the part of `run`'s progress that this takes up, for callers with more to do. Raises SplashbenchError
+    where masks leave nothing to fit, or the anchors are to start from sparse points and there are none.
     """
 
     def progress(fraction: float, message: str) -> None:
         run.progress(span[0] + (span[1] - span[0]) * fraction, message)
 
+    points = _initial_points(scene, settings)
+    n_frames = 1 if settings.frames == "first" else MAX_FRAMES
     plates: list[Plate] = []
     for i, name in enumerate(scene.train):
         progress(0.05 * i / len(scene.train), "liquid-free plates")
-        plates.append(make_plate(scene, name, settings.longest_side))
-    colors = np.concatenate([plate.image[plate.seen] for plate in plates])
-    if not len(colors):
-        raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view throughout; mend the masks")
-    far_color = np.median(colors, axis=0)
+        plate = make_plate(scene, name, settings.longest_side, n_frames)
+        # A view that is liquid throughout says nothing, and has no loss.
+        if plate.seen.any():
+            plates.append(plate)
+    if not plates:
+        when = "in frame 0" if settings.frames == "first" else "throughout"
+        raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; mend the masks")
+    far_color = np.median(np.concatenate([plate.image[plate.seen] for plate in plates]), axis=0) / 255
     progress(0.05, "depths of the background")
-    seed = seed_anchors(scene.initial_points(), plates, settings.anchors, np.random.default_rng(run.seed))
+    seed = _seed(points, plates, settings, run.seed)
     with one_torch_thread():
-        model = fit_model(seed, plates, settings, far_color, run.seed, lambda f: progress(0.1 + 0.9 * f, "background"))
+        model = fit_model(
+            seed, plates, settings, far_color.astype(np.float32), run.seed,
+            lambda fraction: progress(0.1 + 0.9 * fraction, "background"),
+        )  # fmt: skip
         return Background(supervised_anchors(model, plates), far_color)
+
+
+def _initial_points(scene: TrainingScene, settings: BackgroundSettings) -> NDArray[np.float32] | None:
+    """The scene's sparse points; None where there are none and none are needed."""
+    points = scene.initial_points()
+    if settings.start == "points" and (points is None or not len(points)):
+        path = scene.directory / "init_pt_cld.npz"
+        raise SplashbenchError(f"{path} holds no points to start from; add them, or set start=pixels")
+    return points
+
+
+def _seed(
+    points: NDArray[np.float32] | None, plates: list[Plate], settings: BackgroundSettings, random_seed: int
+) -> AnchorSeed:
+    if settings.start == "points":
+        assert points is not None
+        return sparse_anchors(points, settings.anchors)
+    return seed_anchors(points, plates, settings.anchors, np.random.default_rng(random_seed))

@@ -1,7 +1,7 @@
 """Fits the anchors to the plates by gradient descent, then drops what no plate vouches for.
 
-Loss .8 L1 + .2 (1 - SSIM) + .01 mean(prod scale), as in Scaffold-GS, over seen pixels; learning rates its own, decaying
-over the run. No growth of anchors yet: the seeds cover every training pixel from the start.
+Loss .8 L1 + .2 (1 - SSIM) + .01 mean(prod scale), as in Scaffold-GS, over seen pixels. Where the settings ask for it,
+the first steps see smaller images (a step's cost is mostly that of its pixels), and anchors grow (growth.py).
 """
 
 from __future__ import annotations
@@ -12,8 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed
-from splashbench_methods.scaffold_gs.model import AnchorModel
-from splashbench_methods.scaffold_gs.plate import Plate
+from splashbench_methods.scaffold_gs.growth import Growth
+from splashbench_methods.scaffold_gs.losses import l1
+from splashbench_methods.scaffold_gs.model import PER_ANCHOR, AnchorModel, Variant
+from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
+from splashbench_methods.scaffold_gs.plate import Plate, shrunk
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
 from splashbench.render import rasterize
@@ -21,14 +24,49 @@ from splashbench.render.ssim import SsimTarget, ssim
 
 _SSIM_WEIGHT = 0.2
 _VOLUME_WEIGHT = 0.01
-_DECAY = 0.1
+# Of the iterations left, each coarser level of the pyramid takes this share.
+_COARSE_SHARE = 0.5
+# The structural term's targets are kept between steps up to this size, five times a plate's as float32.
+_TARGET_BYTES = 256 << 20
 # An anchor stays if it makes up at least this much of the seen pixels of all training views together.
 _MIN_PIXELS = 0.5
 
 
-def l1(image: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Mean absolute difference of [H, W, 3] images over the pixels where `weight` [H, W] is 1."""
-    return ((image - target).abs() * weight[..., None]).sum() / (3 * weight.sum()).clamp(min=1)
+class _Views:
+    """The plates at one size, in random order, each once before any comes again."""
+
+    def __init__(self, plates: list[Plate], longest_side: int, rng: np.random.Generator) -> None:
+        self.plates = [shrunk(plate, longest_side) for plate in plates]
+        self._rng, self._order = rng, list[int]()
+        self._kept: dict[int, SsimTarget] = {}
+        self._keep = sum(plate.image.size for plate in self.plates) * 4 * 3 <= _TARGET_BYTES
+
+    def next(self) -> int:
+        if not self._order:
+            self._order = self._rng.permutation(len(self.plates)).tolist()
+        return self._order.pop()
+
+    def structure(self, view: int) -> SsimTarget:
+        target = self._kept.get(view)
+        if target is None:
+            plate = self.plates[view]
+            target = SsimTarget(plate.floats(), plate.seen.astype(np.float32))
+            if self._keep:
+                self._kept[view] = target
+        return target
+
+
+def pyramid(longest_side: int, coarse_side: int, iterations: int) -> dict[int, int]:
+    """Iteration at which images of a size (longest side, pixels) are first used, from coarse to fine."""
+    sizes = [longest_side]
+    while sizes[0] > coarse_side:
+        sizes.insert(0, (sizes[0] + 1) // 2)
+    starts: dict[int, int] = {}
+    start = 0.0
+    for size in sizes:
+        starts.setdefault(round(start), size)
+        start += (iterations - start) * _COARSE_SHARE
+    return starts
 
 
 def fit_model(
@@ -39,45 +77,44 @@ def fit_model(
     random_seed: int,
     progress: Callable[[float], None],
 ) -> AnchorModel:
-    """Optimise a model that starts at `seed`; `progress` hears the fraction done."""
-    torch.manual_seed(random_seed)
+    """Optimise a model that starts at `seed`; `progress` hears the fraction done. `plates` show something each."""
     rng = np.random.default_rng(random_seed)
-    model = AnchorModel.from_seed(seed, settings.children, settings.view_dependent_shape)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": [model.offsets], "lr": 0.01},
-            {"params": [model.features], "lr": 0.02},
-            {"params": [model.log_scales], "lr": 0.01},
-            {"params": model.opacity_head.parameters(), "lr": 0.002},
-            {"params": model.shape_head.parameters(), "lr": 0.004},
-            {"params": model.color_head.parameters(), "lr": 0.008},
-        ],
-        eps=1e-15,
-    )
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, _DECAY ** (1 / settings.iterations))
-    unit = float(np.median(seed.spacing))
-    targets = [torch.as_tensor(plate.image) for plate in plates]
-    weights = [torch.as_tensor(plate.seen.astype(np.float32)) for plate in plates]
-    structures = [SsimTarget(plate.image, plate.seen.astype(np.float32)) for plate in plates]
-    behind = torch.as_tensor(far_color)
-    order: list[int] = []
-    for iteration in range(settings.iterations):
-        if not order:
-            order = rng.permutation(len(plates)).tolist()
-        view = order.pop()
-        camera = plates[view].camera
-        means, factors, opacities, colors, scales = model.decode(camera.center)
-        image, _ = rasterize(means, factors, opacities, colors, camera, background=behind)
-        loss = (1 - _SSIM_WEIGHT) * l1(image, targets[view], weights[view])
-        loss = loss + _VOLUME_WEIGHT * (scales / unit).prod(dim=1).mean()
-        if iteration % settings.ssim_every == 0:
-            loss = loss + settings.ssim_every * _SSIM_WEIGHT * (1 - ssim(image, structures[view]))
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        if iteration % 10 == 0:
-            progress(iteration / settings.iterations)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(random_seed)
+        variant = Variant(settings.children, settings.view_dependent_shape, settings.base_color)
+        model = AnchorModel.from_seed(seed, variant)
+        optimizer = AnchorOptimizer(model, settings.rates, settings.iterations)
+        growth = Growth(optimizer, seed.voxel, settings, rng)
+        grow_from, grow_until = (round(f * settings.iterations) for f in (settings.grow_from, settings.grow_until))
+        unit = float(np.median(seed.spacing))
+        behind = torch.as_tensor(far_color)
+        longest = max(max(plate.camera.width, plate.camera.height) for plate in plates)
+        sizes = pyramid(longest, settings.coarse_side, settings.iterations)
+        for iteration in range(settings.iterations):
+            if iteration in sizes:
+                views = _Views(plates, sizes[iteration], rng)
+            view = views.next()
+            plate = views.plates[view]
+            gaussians = model.decode(plate.camera.center)
+            means, factors, opacities, colors, scales = gaussians
+            image, _ = rasterize(means, factors, opacities, colors, plate.camera, background=behind)
+            loss = (1 - _SSIM_WEIGHT) * l1(image, plate)
+            if iteration % settings.ssim_every == 0:
+                loss = loss + settings.ssim_every * _SSIM_WEIGHT * (1 - ssim(image, views.structure(view)))
+            drawn = opacities.detach() > 0
+            volumes = (scales / unit).prod(dim=1) * drawn
+            loss = loss + _VOLUME_WEIGHT * volumes.sum() / drawn.sum().clamp(min=1)
+            growing = grow_from <= iteration < grow_until
+            if growing:
+                means.retain_grad()
+            loss.backward()
+            optimizer.step()
+            if growing:
+                growth.observe(plate.camera, gaussians)
+                if (iteration + 1 - grow_from) % settings.grow_every == 0:
+                    growth.round()
+            if iteration % 10 == 0:
+                progress(iteration / settings.iterations)
     return model
 
 
@@ -88,19 +125,17 @@ def supervised_anchors(model: AnchorModel, plates: list[Plate]) -> AnchorModel:
     training images). The weight of a Gaussian in a set of pixels is the gradient of their summed colour with respect to
     its own colour.
     """
-    n, k = len(model.positions), model.children_per_anchor
-    weight = torch.zeros(n)
+    weight = torch.zeros(len(model))
     for plate in plates:
         with torch.no_grad():
-            drawn = torch.nonzero(model.opacities(plate.camera.center).reshape(-1) > 0)[:, 0]
             means, factors, opacities, colors, _ = model.decode(plate.camera.center)
-        color = torch.zeros_like(colors).requires_grad_()
+        color = torch.zeros_like(colors[:, :1]).requires_grad_()
         image, _ = rasterize(means, factors, opacities, color, plate.camera)
         image[..., 0][torch.as_tensor(plate.seen)].sum().backward()
         assert color.grad is not None
-        weight.index_add_(0, drawn // k, color.grad[:, 0])
+        weight += color.grad.view(len(model), -1).sum(dim=1)
     keep = torch.nonzero(weight >= _MIN_PIXELS)[:, 0]
-    kept = AnchorModel(len(keep), k, model.view_dependent_shape)
-    rows = {"positions", "features", "offsets", "log_scales"}
+    kept = AnchorModel(len(keep), model.variant)
+    rows = {"positions", *PER_ANCHOR}
     kept.load_state_dict({name: t[keep] if name in rows else t for name, t in model.state_dict().items()})
     return kept

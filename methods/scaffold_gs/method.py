@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from splashbench_methods.scaffold_gs.background import Background, fit_background
+from splashbench_methods.scaffold_gs.background import Background
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
+from splashbench_methods.scaffold_gs.shared import shared_background
 
 from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.scene import Camera, Particles, TrainingScene
@@ -37,7 +38,7 @@ class ScaffoldGS(Method):
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
 
     def fit(self, scene: TrainingScene, config: BackgroundSettings, run: Run) -> Fitted:
-        return StaticScene(fit_background(scene, config, run))
+        return StaticScene(shared_background(scene, config, run))
 
     def load(self, directory: Path, scene: TrainingScene) -> Fitted:
         return StaticScene(Background.load(directory / "static"))

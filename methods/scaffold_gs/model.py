@@ -1,20 +1,22 @@
 """Scaffold-GS anchors: a feature per anchor, decoded into K Gaussians for the view at hand.
 
-With anchor position a, log-scales l [6], offsets o [K, 3], feature f [32], view direction d (Lu et al. 2024):
+With anchor position a, log-scales l [6], offsets o [K, 3], feature f [32], view direction d (Lu et al. 2024, Sec. 3.2):
 
     opacity  = tanh(MLP([f, d])), drawn where positive
     scale    = exp(l[3:6]) * sigmoid(MLP([f, d])),  rotation = quaternion of the same MLP
-    colour   = sigmoid(MLP([f, d]) + f[:3])
+    colour   = sigmoid(MLP([f, d]))
     mean     = a + o * exp(l[0:3])
 
-Two departures: the first three feature channels are also the logits of a base colour, which starts at the point's own,
-so that hundreds of iterations suffice instead of tens of thousands; and the view direction goes to opacity and shape
-only on request.
+Two departures on request: with `base_color` the first three feature channels are added to the colour's logits and start
+at the point's own colour, so that hundreds of iterations suffice instead of tens of thousands; without
+`view_dependent_shape` opacity and shape see no view direction.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +26,31 @@ from torch import nn
 
 FEATURES = 32
 HIDDEN = 32
+# Parameters with a row per anchor; the heads are shared.
+PER_ANCHOR = ("features", "offsets", "log_scales")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What kind of model: children per anchor K, and the two departures that the module names."""
+
+    children: int
+    view_dependent_shape: bool = False
+    base_color: bool = True
+
+
+class Gaussians(NamedTuple):
+    """All children of N anchors, M = N K, as seen from one point; child c of anchor i is row i K + c.
+
+    means [M, 3], factors [M, 3, 3] (covariances B B^T), opacities [M] (0 or less: not drawn), colors [M, 3], scales
+    [M, 3]; scene units.
+    """
+
+    means: torch.Tensor
+    factors: torch.Tensor
+    opacities: torch.Tensor
+    colors: torch.Tensor
+    scales: torch.Tensor
 
 
 def _head(outputs: int) -> nn.Sequential:
@@ -35,10 +62,10 @@ class AnchorModel(nn.Module):
 
     positions: torch.Tensor
 
-    def __init__(self, n: int, children: int, view_dependent_shape: bool) -> None:
+    def __init__(self, n: int, variant: Variant) -> None:
         super().__init__()
-        self.children_per_anchor = children
-        self.view_dependent_shape = view_dependent_shape
+        self.variant = variant
+        children = variant.children
         self.register_buffer("positions", torch.zeros(n, 3))
         self.features = nn.Parameter(torch.zeros(n, FEATURES))
         self.offsets = nn.Parameter(torch.zeros(n, children, 3))
@@ -47,17 +74,20 @@ class AnchorModel(nn.Module):
         self.shape_head = _head(7 * children)
         self.color_head = _head(3 * children)
 
+    def __len__(self) -> int:
+        return len(self.positions)
+
     @classmethod
-    def from_seed(cls, seed: AnchorSeed, children: int, view_dependent_shape: bool) -> AnchorModel:
+    def from_seed(cls, seed: AnchorSeed, variant: Variant) -> AnchorModel:
         """A model about to be fitted; random numbers come from torch's generator."""
-        model = cls(len(seed.positions), children, view_dependent_shape)
-        colors = torch.as_tensor(seed.colors).clamp(0.02, 0.98)
+        model = cls(len(seed.positions), variant)
         spacing = torch.as_tensor(seed.spacing)
         with torch.no_grad():
             model.positions.copy_(torch.as_tensor(seed.positions))
             model.features.normal_(std=0.1)
-            model.features[:, :3] = torch.logit(colors)
-            model.offsets.uniform_(-0.7, 0.7)
+            if variant.base_color:
+                model.features[:, :3] = torch.logit(torch.as_tensor(seed.colors).clamp(0.02, 0.98))
+            model.offsets.copy_(random_offsets(len(model), variant.children))
             model.log_scales.copy_(spacing.log()[:, None].expand(-1, 6))
             last = {name: getattr(model, name)[-1] for name in ("opacity_head", "shape_head", "color_head")}
             for layer in last.values():
@@ -65,7 +95,7 @@ class AnchorModel(nn.Module):
                 layer.bias.zero_()
             last["opacity_head"].bias.fill_(math.atanh(0.6))
             # Children that tile the anchor's cell: full spacing divided among them; quaternion near the identity.
-            shape = last["shape_head"].bias.view(children, 7)
+            shape = last["shape_head"].bias.view(variant.children, 7)
             shape[:, :3] = 0.5
             shape[:, 3] = 1.0
         return model
@@ -74,29 +104,28 @@ class AnchorModel(nn.Module):
         """What the colour head reads, and what the opacity and shape heads read: [N, FEATURES + 3] each."""
         direction = nn.functional.normalize(self.positions - torch.as_tensor(eye, dtype=torch.float32), dim=1)
         seen = torch.cat([self.features, direction], dim=1)
-        if self.view_dependent_shape:
+        if self.variant.view_dependent_shape:
             return seen, seen
         return seen, torch.cat([self.features, torch.zeros_like(direction)], dim=1)
 
-    def opacities(self, eye: NDArray) -> torch.Tensor:
-        """tanh opacities [N, K] of all children as seen from `eye` [3], those that are not drawn included."""
-        return torch.tanh(self.opacity_head(self._inputs(eye)[1]))
-
-    def decode(self, eye: NDArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Gaussians as seen from `eye` [3]: means [M, 3], factors [M, 3, 3] (covariances B B^T), opacities [M], colors
-        [M, 3] and scales [M, 3]. Children of non-positive opacity are left out, so M <= N K."""
-        n, k = len(self.positions), self.children_per_anchor
+    def decode(self, eye: NDArray) -> Gaussians:
+        """The Gaussians as seen from `eye` [3]."""
+        rows = len(self) * self.variant.children
         seen, blind = self._inputs(eye)
-        opacity = torch.tanh(self.opacity_head(blind)).reshape(-1)
-        kept = torch.nonzero(opacity > 0)[:, 0]
-        anchor = kept // k
-        shape = self.shape_head(blind).view(n * k, 7)[kept]
-        scales = torch.exp(self.log_scales[:, 3:])[anchor] * torch.sigmoid(shape[:, :3])
-        factor = rotation_matrices(shape[:, 3:]) * scales[:, None]
-        base = self.features[:, None, :3]
-        color = torch.sigmoid(self.color_head(seen).view(n, k, 3) + base).view(n * k, 3)[kept]
+        opacity = torch.tanh(self.opacity_head(blind)).view(rows)
+        shape = self.shape_head(blind).view(len(self), self.variant.children, 7)
+        scales = (torch.exp(self.log_scales[:, None, 3:]) * torch.sigmoid(shape[..., :3])).view(rows, 3)
+        factors = rotation_matrices(shape[..., 3:].reshape(rows, 4)) * scales[:, None]
+        logits = self.color_head(seen).view(len(self), self.variant.children, 3)
+        if self.variant.base_color:
+            logits = logits + self.features[:, None, :3]
         means = self.positions[:, None] + self.offsets * torch.exp(self.log_scales[:, None, :3])
-        return means.view(n * k, 3)[kept], factor, opacity[kept], color, scales
+        return Gaussians(means.view(rows, 3), factors, opacity, torch.sigmoid(logits).view(rows, 3), scales)
+
+
+def random_offsets(n: int, children: int) -> torch.Tensor:
+    """Offsets [n, children, 3] of new anchors, from torch's generator; within the anchor's cell."""
+    return torch.rand(n, children, 3) * 1.4 - 0.7
 
 
 def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:

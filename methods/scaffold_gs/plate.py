@@ -1,8 +1,8 @@
 """The liquid-free plate: what a training view shows when no liquid is in front of it.
 
-The paper fits its background to frame 0. Liquid already in that frame leaves the Gaussians under it without evidence,
-and they show in other views as black blobs. The median over the frames in which a pixel is free of liquid uses more of
-the recording; pixels that are never free carry no loss.
+The paper fits its background to frame 0. Liquid already in that frame would be baked in, or, masked, leave the pixels
+under it without evidence. The median over the frames in which a pixel is free of liquid uses more of the recording;
+pixels that are never free carry no loss.
 """
 
 from __future__ import annotations
@@ -29,26 +29,37 @@ class Plate:
 
     Attributes:
         camera: the view, of the plate's size.
-        image: float32 [H, W, 3] in [0, 1]; black where `seen` is False.
+        image: uint8 [H, W, 3], sRGB; black where `seen` is False.
         seen: bool [H, W], the pixel was free of liquid in at least one frame.
     """
 
     camera: Camera
-    image: NDArray[np.float32]
+    image: NDArray[np.uint8]
     seen: NDArray[np.bool_]
 
+    def floats(self) -> NDArray[np.float32]:
+        """The image as float32 [H, W, 3] in [0, 1]."""
+        return np.asarray(self.image * np.float32(1 / 255))
 
-def make_plate(scene: TrainingScene, name: str, longest_side: int) -> Plate:
-    """The plate of training camera `name`, shrunk so that no side exceeds `longest_side`."""
+
+def make_plate(scene: TrainingScene, name: str, longest_side: int, n_frames: int = MAX_FRAMES) -> Plate:
+    """The plate of training camera `name`, shrunk so that no side exceeds `longest_side`.
+
+    n_frames: it is the median over at most so many frames, evenly spread over the recording; with 1, frame 0 alone.
+    """
     camera = scene.cameras[name]
-    frames = np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, MAX_FRAMES)).round().astype(int))
-    images = np.stack([scene.image(name, t) for t in frames])
+    frames = np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, n_frames)).round().astype(int))
     radius = max(2, round(_MARGIN * max(camera.width, camera.height)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    wet = np.stack([cv2.dilate(scene.mask(name, t).astype(np.uint8), disc) > 0 for t in frames])
-    median = masked_median(images, ~wet)
-    colors: NDArray[np.float32] = np.asarray(median / 255, dtype=np.float32)
-    return shrunk(Plate(camera, colors, np.asarray(~wet.all(axis=0))), longest_side)
+    small = _shrunk_camera(camera, longest_side)
+    images = np.empty((len(frames), small.height, small.width, 3), np.uint8)
+    dry = np.empty(images.shape[:3], bool)
+    # Shrunk one by one: a 4K recording's frames do not fit into memory together.
+    for i, t in enumerate(frames):
+        wet = cv2.dilate(scene.mask(name, t).astype(np.uint8), disc) > 0
+        frame = shrunk(Plate(camera, scene.image(name, t), ~wet), longest_side)
+        images[i], dry[i] = frame.image, frame.seen
+    return Plate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)))
 
 
 def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -64,16 +75,20 @@ def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArra
     return median
 
 
+def _shrunk_camera(camera: Camera, longest_side: int) -> Camera:
+    factor = min(1.0, longest_side / max(camera.width, camera.height))
+    return camera if factor == 1.0 else camera.scaled(factor)
+
+
 def shrunk(plate: Plate, longest_side: int) -> Plate:
     """`plate`, smaller so that no side exceeds `longest_side`."""
-    factor = min(1.0, longest_side / max(plate.camera.width, plate.camera.height))
-    if factor == 1.0:
+    small = _shrunk_camera(plate.camera, longest_side)
+    if small is plate.camera:
         return plate
-    small = plate.camera.scaled(factor)
     size = (small.width, small.height)
     # A shrunk pixel counts where most of it was seen, with the mean of what was.
     share = cv2.resize(plate.seen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    total = cv2.resize(plate.image * plate.seen[..., None], size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize((plate.image * plate.seen[..., None]).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     kept = np.asarray(share > 0.9)
-    mean: NDArray[np.float32] = np.where(kept[..., None], total / np.maximum(share, 1e-6)[..., None], np.float32(0))
-    return Plate(small, mean, kept)
+    mean = np.where(kept[..., None], total / np.maximum(share, 1e-6)[..., None], np.float32(0))
+    return Plate(small, np.clip(np.rint(mean), 0, 255).astype(np.uint8), kept)

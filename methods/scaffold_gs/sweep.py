@@ -40,9 +40,9 @@ def inverse_depth(reference: int, plates: list[Plate], low: float, high: float, 
     plate = plates[reference]
     others = [other for i, other in enumerate(plates) if i != reference]
     planes = np.linspace(low, high, PLANES, dtype=np.float32)
-    image, *sources = (np.dstack([p.image, p.seen.astype(np.float32)]) for p in (plate, *others))
+    image, *sources = (np.dstack([p.floats(), p.seen.astype(np.float32)]) for p in (plate, *others))
     volume = np.empty((PLANES, *plate.seen.shape), np.float32)
-    guide = cv2.ximgproc.createGuidedFilter(plate.image, _RADIUS, _EDGE_VARIANCE)
+    guide = cv2.ximgproc.createGuidedFilter(plate.floats(), _RADIUS, _EDGE_VARIANCE)
     for k, plane in enumerate(planes):
         best = np.full(plate.seen.shape, _UNSEEN, np.float32)
         second = best.copy()

@@ -7,9 +7,9 @@ sank below the shell are dropped.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from splashbench_methods.splashsplat.resample import ShellSettings, cell_of, newborns, within_capacity
@@ -18,12 +18,16 @@ from splashbench_methods.splashsplat.transport import correct, forecast
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 
-Variant = Literal["full", "no_resampling", "per_frame"]
+Variant = Literal["full", "no_resampling", "per_frame", "flip"]
 
 
 @dataclass(frozen=True)
 class CarrierSettings:
-    """Distances in transport voxels. `variant` picks the paper's ablations; "full" is the method."""
+    """Distances in transport voxels. `variant` picks the paper's ablations; "full" is the method.
+
+    "no_resampling": carriers of the first liquid only. "per_frame": new ones in every frame, none moved. "flip":
+    carriers of the first liquid, moved by a simulation that looks at no other frame (flip.py).
+    """
 
     variant: Variant = "full"
     correction: float = 1.0
@@ -31,6 +35,14 @@ class CarrierSettings:
     kill_inside: float | None = -3.0
     cell_capacity: int | None = 4
     shell: ShellSettings = field(default_factory=ShellSettings)
+
+
+class Simulation(Protocol):
+    """Moves carriers by itself from where it was started."""
+
+    def forecast(self, ids: np.ndarray, deformation: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [N, 3] and F [N, 3, 3] of the carriers `ids` after the frame step number `step`."""
+        ...
 
 
 @dataclass
@@ -94,35 +106,53 @@ def track_carriers(
     factor: int,
     settings: CarrierSettings,
     seed: int,
+    seen: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    landed: Callable[[int, np.ndarray, np.ndarray], np.ndarray] | None = None,
+    simulation: Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation] | None = None,
 ) -> Carriers:
     """Run the loop over all frames.
 
     fields: phi_t on `hull_grid`, one frame after another, in transport voxels. grid: the transport grid. velocities:
-    float32 [T - 1, cx, cy, cz, 3] control values, `factor` transport voxels apart.
+    float32 [T - 1, cx, cy, cz, 3] control values, `factor` transport voxels apart. seen: given phi_t and hull-grid
+    coordinates [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. landed: given
+    t, where carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3].
+    simulation: makes one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
     """
     ratio = np.float32(grid.voxel / hull_grid.voxel)
     ids = np.zeros(0, dtype=np.int32)
     x = np.zeros((0, 3), dtype=np.float32)
     F = np.zeros((0, 3, 3), dtype=np.float32)
     born = 0
+    simulated: Simulation | None = None
     frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     for t, phi in enumerate(fields):
         if settings.variant == "per_frame":
             ids, x, F = ids[:0], x[:0], F[:0]
+        elif simulated is not None:
+            x, F = simulated.forecast(ids, F, t - 1)
+            inside = sample(phi, x * ratio) <= settings.kill_outside
+            ids, x, F = ids[inside], x[inside], F[inside]
         elif t > 0 and len(ids):
+            start = x
             x, F = forecast(velocities[t - 1], factor, x, F)
+            if landed is not None:
+                x = landed(t, start, x)
             x = correct(phi, x, float(ratio), settings.correction)
             alive = _alive(phi, x, ratio, settings)
             if settings.cell_capacity is not None:
                 alive[alive] = within_capacity(cell_of(x[alive], grid), ids[alive], settings.cell_capacity)
             ids, x, F = ids[alive], x[alive], F[alive]
         # Without resampling, the first frame that shows liquid is the only one that gives carriers.
-        if settings.variant != "no_resampling" or born == 0:
+        if settings.variant not in ("no_resampling", "flip") or born == 0:
             new = newborns(phi, grid, float(ratio), x, settings.shell, np.random.default_rng([seed, t]))
+            if seen is not None:
+                new = new[seen(phi, new * ratio)]
             ids = np.concatenate([ids, np.arange(born, born + len(new), dtype=np.int32)])
             x = np.concatenate([x, new])
             F = np.concatenate([F, np.broadcast_to(np.eye(3, dtype=np.float32), (len(new), 3, 3))])
             born += len(new)
+            if simulation is not None and settings.variant == "flip" and born:
+                simulated = simulation(phi, ids, x)
         frames.append((ids, x, F, sample(phi, x * ratio)))
     starts = np.concatenate([[0], np.cumsum([len(frame[0]) for frame in frames])]).astype(np.int64)
     all_ids, positions, deformation, depth = (np.concatenate(column) for column in zip(*frames))

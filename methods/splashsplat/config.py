@@ -32,7 +32,19 @@ class SplashSplatConfig(MethodConfig):
     transport_cells: int = Field(112, ge=16, le=256)
     control_cells: int = Field(28, ge=4, le=128)
     distance: DistanceMethod = "silhouette"
+    #: use the container's mesh, where the scene has one: what it hides, and where its walls are
+    container: bool = True
+    #: tell masks with much missing, beside empty ones
+    detect_failures: bool = True
+    #: carve with each camera's own times, where the scene has them
+    camera_times: bool = True
+    #: level the liquid that rests in the container (needs the mesh and gravity)
+    pool: bool = True
     # Velocity
+    #: free fall for the jet (needs gravity and the metric scale)
+    ballistic: bool = True
+    #: no motion where the level set's does not lead nearer to the next observation
+    gate_motion: bool = True
     velocity_steps: int = Field(35, ge=0)
     velocity_step_size: PositiveFloat = 0.45
     velocity_band: PositiveFloat = 4.0
@@ -49,6 +61,8 @@ class SplashSplatConfig(MethodConfig):
     shell_depth: PositiveFloat = 1.5
     min_per_cell: PositiveInt = 2
     max_per_cell: PositiveInt = 4
+    #: no carriers where no training view can see them
+    visible_only: bool = True
     # Decoder
     feature_size: PositiveInt = 32
     children: int = Field(2, ge=1, le=6)
@@ -80,6 +94,13 @@ class SplashSplatConfig(MethodConfig):
             "transport_cells": 96,
             "control_cells": 24,
             "distance": "carve",
+            "container": False,
+            "detect_failures": False,
+            "camera_times": False,
+            "pool": False,
+            "ballistic": False,
+            "gate_motion": False,
+            "visible_only": False,
             "velocity_smooth": "field",
             "kill_inside": None,
             "cell_capacity": None,

@@ -2,6 +2,8 @@
 
 Heads shared by all carriers and frames turn a carrier's feature f into K children in its frame A = F diag(s): offset,
 scale and opacity by linear heads, colour by a two-layer perceptron that also sees the viewing direction.
+`Decoder.forward` is the definition, in plain torch; `Decoder.decode` computes the same, on the CPU by the kernel of
+splashbench.render.decode.
 """
 
 from __future__ import annotations
@@ -10,7 +12,10 @@ import math
 from dataclasses import dataclass
 
 import torch
+from splashbench_methods.splashsplat import losses
 from torch import Tensor, nn
+
+from splashbench.render.decode import Heads, Instant, decode
 
 # Where the children start, in units of the offset bound: half a unit to either side, one unit apart as in the
 # supplement.
@@ -36,12 +41,14 @@ class DecoderSettings:
 class CarrierState:
     """What the decoder needs of n active carriers at one instant.
 
-    positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels.
+    positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels. visibility: [n] in [0, 1], by
+    which opacities are multiplied where the carriers are hidden from the view at hand; all are seen by default.
     """
 
     positions: Tensor
     deformation: Tensor
     phi: Tensor
+    visibility: Tensor | None = None
 
 
 @dataclass
@@ -54,6 +61,36 @@ class Children:
     opacities: Tensor
     colours: Tensor
     offsets: Tensor
+
+
+@dataclass
+class ColourCells:
+    """Cells of space whose carriers should agree in colour.
+
+    of_carriers: int64 [n], numbered from 0 without gaps. sizes: float [cells], carriers in each.
+    """
+
+    of_carriers: Tensor
+    sizes: Tensor
+
+
+@dataclass
+class Penalties:
+    """What the objective says of the children themselves, scalars: `losses.covariance_loss` in squared scene units,
+    `separation_loss` and `colour_loss`."""
+
+    covariance: Tensor
+    separation: Tensor
+    colour: Tensor
+
+
+def penalties(children: Children, cells: ColourCells) -> Penalties:
+    """The penalties on children, in plain torch."""
+    return Penalties(
+        losses.covariance_loss(children.factors, voxel=1.0),
+        losses.separation_loss(children.offsets),
+        losses.colour_loss(children.colours, cells.of_carriers, cells.sizes),
+    )
 
 
 class Decoder(nn.Module):
@@ -99,11 +136,50 @@ class Decoder(nn.Module):
         extent = base[:, None] * torch.exp(s.scale_range * residual) / math.sqrt(k)
         factors = state.deformation[:, None] * extent[:, :, None, :]
         fade = torch.sigmoid(s.opacity_slope * (s.opacity_band - state.phi.abs()))
+        if state.visibility is not None:
+            fade = fade * state.visibility
         opacities = torch.sigmoid(self.opacity(features)) * fade[:, None]
         direction = nn.functional.normalize(state.positions - eye, dim=1)
         hidden = torch.relu(self.colour_hidden(torch.cat([features, direction], dim=1)))
         colours = torch.sigmoid(self.colour_out(hidden)).view(n, k, 3)
         return Children(means, factors, opacities, colours, offsets)
+
+    def decode(
+        self,
+        features: Tensor,
+        log_scales: Tensor,
+        rows: Tensor,
+        state: CarrierState,
+        eye: Tensor,
+        cells: ColourCells | None = None,
+    ) -> tuple[Children, Penalties | None]:
+        """Children of the carriers `rows` (int64 [n], ascending) of the tables, as `forward` has them, and with `cells`
+        also the penalties on them. The gradients of the tables are sparse."""
+        tables = (features, log_scales)
+        if all(table.device.type == "cpu" and table.dtype == torch.float32 for table in tables):
+            groups = () if cells is None else (cells.of_carriers, len(cells.sizes))
+            instant = Instant(state.positions, state.deformation, state.phi, eye, state.visibility, *groups)
+            *children, terms = decode(self.heads(), *tables, instant, rows)
+            return Children(*children), None if terms is None else Penalties(*terms.unbind())
+        active = [nn.functional.embedding(rows, table, sparse=True) for table in tables]
+        result = self(*active, state, eye)
+        return result, None if cells is None else penalties(result, cells)
+
+    def heads(self) -> Heads:
+        """The heads as the kernel takes them."""
+        s = self.settings
+        return Heads(
+            offset=(self.offset.weight, self.offset.bias),
+            scale=(self.scale.weight, self.scale.bias),
+            opacity=(self.opacity.weight, self.opacity.bias),
+            hidden=(self.colour_hidden.weight, self.colour_hidden.bias),
+            color=(self.colour_out.weight, self.colour_out.bias),
+            offset_bound=s.offset_bound,
+            scale_range=s.scale_range,
+            opacity_slope=s.opacity_slope,
+            opacity_band=s.opacity_band,
+            separation_margin=losses.SEPARATION_MARGIN,
+        )
 
     def mean_opacity(self, features: Tensor) -> Tensor:
         """Learned opacity of each carrier, the mean over its children without the fade by phi: [n]."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -18,8 +18,10 @@ from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import (
     CarrierState,
     Children,
+    ColourCells,
     Decoder,
     DecoderSettings,
+    Penalties,
     initial_log_scale,
 )
 from splashbench_methods.splashsplat.optimizer import RowAdam
@@ -29,6 +31,7 @@ from torch import Tensor
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Grid
 from splashbench.render import rasterize
+from splashbench.render.window_loss import window_losses
 from splashbench.scene.camera import Camera
 
 
@@ -86,29 +89,23 @@ def composite(children: Children, camera: Camera, background: Tensor) -> tuple[T
 
 
 def total_loss(
-    children: Children,
+    penalties: Penalties,
     image: Tensor,
     alpha: Tensor,
     target: Target,
-    cells: tuple[Tensor, Tensor],
     voxel: float,
     weights: losses.LossWeights,
     ssim_weight: float,
 ) -> Tensor:
     """The weighted sum of all terms (Eq. total_loss); `ssim_weight` replaces weights.ssim."""
-    truth = target.image.to(torch.float32) / 255
-    mask = target.mask.to(torch.float32)
-    near = target.box
-    loss = weights.foreground * losses.foreground_loss(image[near], truth[near], mask[near])
-    loss = loss + weights.gradient * losses.gradient_loss(image[near], truth[near], mask[near])
+    foreground, gradient, silhouette = window_losses(image, alpha, target.photograph)
+    loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / target.area
     if ssim_weight > 0:
-        loss = loss + ssim_weight * losses.ssim_loss(image[near], truth[near])
-    loss = loss + weights.silhouette * losses.silhouette_loss(alpha, mask, target.area)
-    loss = loss + weights.covariance * losses.covariance_loss(children.factors, voxel)
-    if weights.separation > 0:
-        loss = loss + weights.separation * losses.separation_loss(children.offsets)
-    if weights.colour > 0:
-        loss = loss + weights.colour * losses.colour_loss(children.colours, *cells)
+        truth = target.photograph.image.to(torch.float32) / 255
+        loss = loss + ssim_weight * losses.ssim_loss(image[target.photograph.box], truth)
+    loss = loss + weights.covariance * penalties.covariance / voxel**2
+    loss = loss + weights.separation * penalties.separation
+    loss = loss + weights.colour * penalties.colour
     return loss
 
 
@@ -123,11 +120,11 @@ def frame_states(carriers: Carriers, grid: Grid) -> list[CarrierState]:
     return states
 
 
-def _colour_cells(carriers: Carriers, t: int, size: float) -> tuple[Tensor, Tensor]:
-    """Cell of each carrier of frame `t`, and each cell's population; cells of `size` transport voxels."""
+def _colour_cells(carriers: Carriers, t: int, size: float) -> ColourCells:
+    """The cells of frame `t`'s carriers, of `size` transport voxels."""
     keys = np.floor(carriers.positions[carriers.rows(t)] / size).astype(np.int64)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    return torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32))
+    return ColourCells(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32)))
 
 
 def fit_appearance(
@@ -147,11 +144,12 @@ def fit_appearance(
     states = frame_states(carriers, grid)
     ids = [torch.from_numpy(carriers.ids[carriers.rows(t)].astype(np.int64)) for t in range(len(states))]
     cells = [_colour_cells(carriers, t, colour_cell) for t in range(len(states))]
-    heads = torch.optim.Adam(appearance.decoder.parameters(), lr=settings.learning_rate_heads)
-    tables = (
-        RowAdam(appearance.features, settings.learning_rate_features),
-        RowAdam(appearance.log_scales, settings.learning_rate_scales),
-    )
+    decoder = appearance.decoder
+    parameters = list(decoder.parameters())
+    heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
+    features, log_scales = appearance.features.detach(), appearance.log_scales.detach()
+    rates = (settings.learning_rate_features, settings.learning_rate_scales)
+    tables = [RowAdam(table.requires_grad_(), rate) for table, rate in zip((features, log_scales), rates)]
     rng = np.random.default_rng([seed, 1])
     queue: list[int] = []
     history: list[float] = []
@@ -160,29 +158,29 @@ def fit_appearance(
             queue = rng.permutation(len(targets)).tolist()
         target = targets[queue.pop()]
         active = ids[target.frame]
-        rows = [table.table.index_select(0, active).requires_grad_() for table in tables]
-        children = appearance.decoder(*rows, states[target.frame], target.eye)
+        state = replace(states[target.frame], visibility=target.visibility)
+        children, penalties = decoder.decode(features, log_scales, active, state, target.eye, cells[target.frame])
         image, alpha = composite(children, target.camera, target.background)
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
-        loss = total_loss(
-            children, image, alpha, target, cells[target.frame], grid.voxel, settings.weights, ssim_weight
-        )
+        loss = total_loss(penalties, image, alpha, target, grid.voxel, settings.weights, ssim_weight)
         history.append(float(loss.detach()))
         if not math.isfinite(history[-1]):
             raise SplashbenchError(
                 f"the loss of splashsplat is {history[-1]} at iteration {iteration + 1}; lower the learning rates"
             )
-        heads.zero_grad()
-        loss.backward()
+        gradients = torch.autograd.grad(loss, [features, log_scales, *parameters])
+        by_table, by_head = gradients[:2], gradients[2:]
         factor = 1.0
         if settings.anneal:
             factor = 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * iteration / settings.iterations))
+        for parameter, gradient in zip(parameters, by_head):
+            parameter.grad = gradient
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
-        for table, row in zip(tables, rows):
-            table.step(active, row.grad, factor)
+        for table, gradient in zip(tables, by_table):
+            table.step(active, gradient.coalesce().values(), factor)
         progress((iteration + 1) / settings.iterations)
     return history
 

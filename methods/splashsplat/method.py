@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -10,12 +11,14 @@ import torch
 from splashbench_methods.splashsplat.config import SplashSplatConfig
 from splashbench_methods.splashsplat.fit import composite
 from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.occlusion import Occlusion
 from splashbench_methods.splashsplat.reconstruct import fit_liquid
 from splashbench_methods.splashsplat.subframe import state_at
 
 from splashbench.adapter.contract import Fitted, Method, Render, Run, Support
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene.camera import Camera
+from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
 
@@ -28,11 +31,12 @@ _BACKGROUND = 0.25
 
 
 class FittedSplashSplat(Fitted):
-    """Liquid over a frozen background. The liquid lies in front: there is no depth order between the two yet."""
+    """Liquid over a frozen background: in front of it, but for what the container hides."""
 
-    def __init__(self, liquid: Liquid, background: Background) -> None:
+    def __init__(self, liquid: Liquid, background: Background, occlusion: Occlusion | None = None) -> None:
         self.liquid = liquid
         self.background = background
+        self.occlusion = occlusion
         self._background_image: tuple[Camera, np.ndarray] | None = None
 
     def _background(self, camera: Camera) -> np.ndarray:
@@ -48,10 +52,13 @@ class FittedSplashSplat(Fitted):
         ids, state = state_at(self.liquid, time)
         if len(ids) == 0:
             return Render(background.numpy().copy(), np.zeros(background.shape[:2], dtype=np.float32))
+        if self.occlusion is not None:
+            behind = torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
+            state = replace(state, visibility=1 - behind.to(torch.float32))
         look = self.liquid.appearance
         eye = torch.tensor(camera.center, dtype=torch.float32)
         with one_torch_thread():
-            children = look.decoder(look.features[ids], look.log_scales[ids], state, eye)
+            children, _ = look.decoder.decode(look.features, look.log_scales, ids, state, eye)
             rgb, alpha = composite(children, camera, background)
             return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
 
@@ -59,12 +66,18 @@ class FittedSplashSplat(Fitted):
         """The carriers."""
         return self.liquid.particles()
 
+    def signed_distance(self) -> SignedDistance:
+        """phi of every frame, as the carriers were held to it."""
+        return self.liquid.signed_distance()
+
     def save(self, directory: Path) -> None:
         """The liquid's files, and the background under static/."""
         self.liquid.save(directory)
         static = directory / "static"
         static.mkdir(exist_ok=True)
         self.background.save(static)
+        if self.occlusion is not None:
+            self.occlusion.save(static)
 
 
 class SplashSplat(Method):
@@ -83,18 +96,19 @@ class SplashSplat(Method):
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
         """Background, observation fields, carriers, appearance, in that order."""
-        from splashbench_methods.scaffold_gs import fit_background
+        from splashbench_methods.scaffold_gs import shared_background
 
-        with one_torch_thread():
-            background = fit_background(scene, config.background, run, span=(0, _BACKGROUND))
+        with run.stage("background"), one_torch_thread():
+            background = shared_background(scene, config.background, run, span=(0, _BACKGROUND))
         images = {
             name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()
         }
-        liquid = fit_liquid(scene, images, config, run, span=(_BACKGROUND, 1))
-        return FittedSplashSplat(liquid, background)
+        liquid, occlusion = fit_liquid(scene, images, config, run, span=(_BACKGROUND, 1))
+        return FittedSplashSplat(liquid, background, occlusion)
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""
         from splashbench_methods.scaffold_gs import Background
 
-        return FittedSplashSplat(Liquid.load(directory), Background.load(directory / "static"))
+        static = directory / "static"
+        return FittedSplashSplat(Liquid.load(directory), Background.load(static), Occlusion.load(static))

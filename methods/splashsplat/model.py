@@ -13,16 +13,17 @@ import torch
 from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.fit import Appearance
-from splashbench_methods.splashsplat.transport import forecast
+from splashbench_methods.splashsplat.velocity import velocities_at
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_npz, write_json
 from splashbench.observe.grid import Grid
+from splashbench.scene.geometry import STEPS_PER_VOXEL, SignedDistance
 from splashbench.scene.particles import Particles
 
 FORMAT = 1
 # phi is needed between frames only and matters within a few voxels of the interface: 1/16 voxel, up to +-7.9 voxels.
-PHI_STEPS_PER_VOXEL = 16
+PHI_STEPS_PER_VOXEL = STEPS_PER_VOXEL
 
 
 def _position_steps(grid: Grid) -> float:
@@ -44,7 +45,7 @@ def store_precision(carriers: Carriers, grid: Grid) -> Carriers:
 
 def pack_phi(phi: np.ndarray) -> np.ndarray:
     """Signed distance in voxels to int8."""
-    return np.round(np.clip(phi * PHI_STEPS_PER_VOXEL, -127, 127)).astype(np.int8)
+    return SignedDistance.of(phi[None], np.zeros(3), 1.0).phi[0]
 
 
 @dataclass
@@ -80,7 +81,7 @@ class Liquid:
         return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance)
 
     def particles(self) -> Particles:
-        """The carriers as particles; velocities are the displacements to the next frame over the true time step."""
+        """The carriers as particles, with the velocity of the liquid where they are, scene units per second."""
         n_frames, count = self.carriers.n_frames, self.carriers.count
         positions = np.zeros((n_frames, count, 3), dtype=np.float32)
         velocities = np.zeros_like(positions)
@@ -88,15 +89,19 @@ class Liquid:
         for t in range(n_frames):
             rows = self.carriers.rows(t)
             ids = self.carriers.ids[rows]
-            x, F = self.carriers.positions[rows], self.carriers.deformation[rows]
+            x = self.carriers.positions[rows]
             positions[t, ids] = self.grid.to_scene(x)
             active[t, ids] = True
             if n_frames > 1 and len(ids):
                 step = min(t, n_frames - 2)  # the last frame has no step of its own
-                moved, _ = forecast(self.velocities[step].astype(np.float32), self.factor, x, F)
                 seconds = self.times[step + 1] - self.times[step]
-                velocities[t, ids] = (moved - x) * (self.grid.voxel / seconds)
+                control = self.velocities[step].astype(np.float32)
+                velocities[t, ids] = velocities_at(control, self.factor, x) * (self.grid.voxel / seconds)
         return Particles(positions=positions, active=active, velocities=velocities)
+
+    def signed_distance(self) -> SignedDistance:
+        """phi_t of every frame on the transport grid."""
+        return SignedDistance(self.phi, self.grid.origin, self.grid.voxel)
 
     def save(self, directory: Path) -> None:
         """Write liquid.json and four .npz files into `directory`."""

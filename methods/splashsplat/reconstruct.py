@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
-from splashbench_methods.splashsplat.carriers import Carriers, track_carriers
+from splashbench_methods.splashsplat.carriers import Carriers, Simulation, track_carriers
 from splashbench_methods.splashsplat.config import SplashSplatConfig
 from splashbench_methods.splashsplat.fit import (
     Appearance,
@@ -16,37 +14,31 @@ from splashbench_methods.splashsplat.fit import (
     initial_appearance,
     visible_carriers,
 )
+from splashbench_methods.splashsplat.flip import FlipSolver, FlipTransport, gravity_in_voxels
 from splashbench_methods.splashsplat.model import Liquid, pack_phi, store_precision
+from splashbench_methods.splashsplat.motion import gated, with_jet
+from splashbench_methods.splashsplat.occlusion import Occlusion
+from splashbench_methods.splashsplat.survey import Survey, survey
 from splashbench_methods.splashsplat.targets import collect_targets
 from splashbench_methods.splashsplat.velocity import control_shape, fit_velocity
+from splashbench_methods.splashsplat.visibility import seen_by_any
 
 from splashbench.adapter.contract import Run
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames
+from splashbench.observe.container import solid_distance
+from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.kernels import resample
+from splashbench.observe.shadow import ContainerShadow
 from splashbench.observe.signed_distance import PADDING
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene.scene import TrainingScene
 
 Report = Callable[[float, str], None]
-log = logging.getLogger(__name__)
 
 # Share of the time that everything before the appearance takes, for the progress bar only.
 _TRACKING = 0.25
-
-
-class Stages:
-    """Adds up how long each stage takes; stages may interleave."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+# A carrier is seen through at most this many shells of liquid.
+SEEN_THROUGH = 1.5
 
 
 class Observations:
@@ -56,12 +48,38 @@ class Observations:
     (float32 [T - 1, cx, cy, cz, 3], voxels per frame) and packed[t] (int8, see `pack_phi`) are filled in.
     """
 
-    def __init__(self, scene: TrainingScene, config: SplashSplatConfig, stages: Stages, report: Report) -> None:
-        self._config, self._stages, self._report = config, stages, report
-        with stages("signed distance"):
-            self._silhouettes = Silhouettes(scene)
-            bounds = sequence_bounds(self._silhouettes).padded(PADDING)
+    def __init__(self, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report) -> None:
+        self._config, self._run, self._report = config, run, report
+        self._times = scene.times
+        with run.stage("signed distance"):
+            self.silhouettes = Silhouettes(scene, interpolate_times=None if config.camera_times else False)
+            self._container = ContainerShadow.of(scene) if config.container else None
+        if config.detect_failures:
+            with run.stage("failed masks"):
+                distrust_failed_masks(self.silhouettes, self._container)
+        with run.stage("signed distance"):
+            bounds = sequence_bounds(self.silhouettes, self._container).padded(PADDING)
         self.hull_grid, self.grid = Grid.over(bounds, config.hull_cells), Grid.over(bounds, config.transport_cells)
+        #: what the container hides, where it does
+        self.occlusion: Occlusion | None = None
+        if self._container is not None and self._container.hides:
+            self.occlusion = Occlusion(self._container.mesh, self.hull_grid.voxel)
+        cameras = self.silhouettes.cameras
+        self._shadows = [None if self.occlusion is None else self.occlusion.depth(camera) for camera in cameras]
+        self._survey: Survey | None = None
+        if scene.gravity is not None and (config.pool or config.ballistic):
+            with run.stage("survey"):
+                self._survey = survey(
+                    self.silhouettes,
+                    bounds,
+                    self._container,
+                    scene.gravity,
+                    scene.metres_per_unit,
+                    scene.times,
+                    self._shadows,
+                    find_pool=config.pool,
+                    find_jets=config.ballistic,
+                )
         self.n_frames = scene.n_frames
         control = control_shape(self.grid.shape, config.control_factor)
         self.velocities = np.zeros((self.n_frames - 1, *control, 3), dtype=np.float32)
@@ -70,20 +88,72 @@ class Observations:
     def __iter__(self) -> Iterator[np.ndarray]:
         config = self._config
         ratio = self.grid.voxel / self.hull_grid.voxel
-        frames = signed_distance_frames(self._silhouettes, self.hull_grid, config.distance)
+        frames = signed_distance_frames(self.silhouettes, self.hull_grid, config.distance, self._container)
         before: np.ndarray | None = None
         for t in range(self.n_frames):
-            with self._stages("signed distance"):
-                phi = next(frames) / np.float32(ratio)
+            with self._run.stage("signed distance"):
+                phi = next(frames)
+                if self._survey is not None:
+                    phi = self._survey.refined(phi, self.hull_grid, t)
+                phi = phi / np.float32(ratio)
                 now = resample(phi, self.grid.shape, ratio)
                 self.packed[t] = pack_phi(now)
-            with self._stages("velocity"):
+            with self._run.stage("velocity"):
                 if before is not None and config.variant != "per_frame":
-                    fit = fit_velocity(before, now, config.control_factor, config.velocity)
-                    self.velocities[t - 1] = fit.control
+                    self.velocities[t - 1] = self._motion(before, now, t - 1)
             before = now
-            yield phi
+            with self._run.stage("carriers"):  # what is done with phi until the next is asked for
+                yield phi
             self._report((t + 1) / self.n_frames, "signed distance, velocity, carriers")
+
+    def _motion(self, before: np.ndarray, after: np.ndarray, t: int) -> np.ndarray:
+        """u_t on the control grid, voxels per frame: the level set's, and where more is known, that (motion.py)."""
+        config, factor = self._config, self._config.control_factor
+        control = fit_velocity(before, after, factor, config.velocity).control
+        if config.gate_motion:
+            control = gated(control, factor, before, after)
+        jet = None if self._survey is None else self._survey.jets[t]
+        if self._survey is None or jet is None:
+            return control
+        duration = float(self._times[t + 1] - self._times[t])
+        return with_jet(control, factor, self.grid, self._survey.turn, jet, self._survey.jet_floor(t), duration)
+
+    def landed(self, t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Where carriers that fly from `start` to `end` [N, 3] (transport grid) come to rest in frame `t`."""
+        return end if self._survey is None else self._survey.landed(self.grid, t, start, end)
+
+    def simulation(self, scene: TrainingScene, seed: int) -> Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]:
+        """Starts FLIP from the first carriers. Raises SplashbenchError where gravity or the scale are not known."""
+        gravity = gravity_in_voxels(scene, self.grid)
+        mesh = scene.container_mesh()
+        solid = None if mesh is None else solid_distance(mesh, self.grid)
+
+        def start(phi: np.ndarray, ids: np.ndarray, positions: np.ndarray) -> Simulation:
+            solver = FlipSolver(self.grid.shape, gravity, solid)
+            ratio = self.grid.voxel / self.hull_grid.voxel
+            transport = FlipTransport(solver, phi, ratio, ids, positions, np.random.default_rng([seed, 2]))
+            return _Steps(transport, np.diff(self._times), self.velocities, self._config.control_factor)
+
+        return start
+
+    def seen(self, phi: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Which hull-grid coordinates `points` [N, 3] the training views see in phi (transport voxels): bool [N]."""
+        limit = SEEN_THROUGH * self._config.shell_depth * self.grid.voxel / self.hull_grid.voxel
+        return seen_by_any(phi, self.hull_grid, points, self.silhouettes.cameras, self._shadows, limit)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """FLIP by the scene's frame steps."""
+
+    transport: FlipTransport
+    durations: np.ndarray
+    velocities: np.ndarray
+    factor: int
+
+    def forecast(self, ids: np.ndarray, deformation: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+        duration = float(self.durations[step])
+        return self.transport.forecast(ids, deformation, duration, self.velocities[step], self.factor)
 
 
 def fit_liquid(
@@ -92,8 +162,8 @@ def fit_liquid(
     config: SplashSplatConfig,
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
-) -> Liquid:
-    """Reconstruct the liquid of `scene`.
+) -> tuple[Liquid, Occlusion | None]:
+    """Reconstruct the liquid of `scene`; and what hides it from cameras.
 
     backgrounds: float32 [H, W, 3] of every training view, in [0, 1]. span: the part of `run`'s progress this takes up.
     """
@@ -101,18 +171,32 @@ def fit_liquid(
     def report(fraction: float, message: str) -> None:
         run.progress(span[0] + (span[1] - span[0]) * fraction, message)
 
-    stages = Stages()
-    observations = Observations(scene, config, stages, lambda done, message: report(_TRACKING * done, message))
-    grid, factor = observations.grid, config.control_factor
-    with stages("tracking, all in all"):
-        carriers = track_carriers(
-            observations, observations.hull_grid, grid, observations.velocities, factor, config.carriers, run.seed
-        )
-        carriers = store_precision(carriers, grid)
-    with stages("appearance"), one_torch_thread():
+    observations = Observations(scene, config, run, lambda done, message: report(_TRACKING * done, message))
+    grid, factor, occlusion = observations.grid, config.control_factor, observations.occlusion
+    carriers = track_carriers(
+        observations,
+        observations.hull_grid,
+        grid,
+        observations.velocities,
+        factor,
+        config.carriers,
+        run.seed,
+        observations.seen if config.visible_only else None,
+        observations.landed if config.ballistic else None,
+        observations.simulation(scene, run.seed) if config.variant == "flip" else None,
+    )
+    carriers = store_precision(carriers, grid)
+    with run.stage("appearance"), one_torch_thread():
         appearance = initial_appearance(carriers.count, grid.voxel, config.optimisation, config.decoder, run.seed)
         positions = [grid.to_scene(carriers.positions[carriers.rows(t)]) for t in range(carriers.n_frames)]
-        targets = collect_targets(scene, backgrounds, positions, config.silhouette_norm)
+        targets = collect_targets(
+            scene,
+            backgrounds,
+            positions,
+            config.silhouette_norm,
+            trusted=~observations.silhouettes.failed_masks,
+            hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
+        )
         if targets:
             fit_appearance(
                 appearance,
@@ -125,8 +209,8 @@ def fit_liquid(
                 lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
             )
         carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
-    log.info(", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in stages.seconds.items()))
-    return Liquid.of(scene.times, grid, carriers, observations.velocities, factor, observations.packed, appearance)
+    liquid = Liquid.of(scene.times, grid, carriers, observations.velocities, factor, observations.packed, appearance)
+    return liquid, occlusion
 
 
 def _pruned(carriers: Carriers, appearance: Appearance, threshold: float) -> tuple[Carriers, Appearance]:

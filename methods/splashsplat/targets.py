@@ -1,17 +1,21 @@
 """Training targets: for each time-camera pair, the window of the image that the liquid and its carriers cover.
 
 Outside the window neither mask nor carriers reach, so the losses lose nothing by leaving it out, and rasterising the
-window alone is several times cheaper than the whole view.
+window alone is several times cheaper than the whole view. Of photograph and mask a target keeps the mask's bounding box
+and 8 pixels around it, at four bytes a pixel; backgrounds are shared.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.render.window_loss import Photograph
 from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
@@ -22,19 +26,23 @@ MASK_MARGIN = 8
 class Target:
     """One time-camera pair.
 
-    camera: of the window. image: uint8 [h, w, 3]; mask: bool [h, w]; background: float32 [h, w, 3] in [0, 1]. box:
-    rows and columns of the mask's padded bounding box within the window. area: pixels over which the silhouette term
-    averages.
+    camera: of the window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
+    kept. background: float32 [h, w, 3] in [0, 1], a view of the camera's own. area: pixels over which the silhouette
+    term averages. hidden: bool [n], carriers of the frame that the container hides from the view, or None.
     """
 
     frame: int
     camera: Camera
     eye: Tensor
-    image: Tensor
-    mask: Tensor
+    photograph: Photograph
     background: Tensor
-    box: tuple[slice, slice]
     area: float
+    hidden: Tensor | None = None
+
+    @property
+    def visibility(self) -> Tensor | None:
+        """1 for the carriers that the view can see and 0 for those that the container hides, float32 [n], or None."""
+        return None if self.hidden is None else 1 - self.hidden.to(torch.float32)
 
 
 def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
@@ -70,39 +78,47 @@ def collect_targets(
     backgrounds: dict[str, np.ndarray],
     positions: list[np.ndarray],
     silhouette_norm: str,
+    trusted: np.ndarray | None = None,
+    hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
 ) -> list[Target]:
-    """All pairs whose mask is not empty and whose frame has carriers; a failed (empty) mask is no target.
+    """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
     backgrounds: float32 [H, W, 3] of each training view. positions: of the carriers of each frame [n, 3], scene
-    units. silhouette_norm: "image" averages the silhouette term over the view's sequence-wide liquid window (the
-    paper's images are such crops), "mask" over the mask.
+    units. trusted: bool [T, V], by default all. hidden: given a view's name and positions [n, 3], which of them the
+    container hides (bool [n]). silhouette_norm: "image" averages the silhouette term over the view's sequence-wide
+    liquid window (the paper's images are such crops), "mask" over the mask.
     """
     targets = []
-    for name in scene.train:
+    for view, name in enumerate(scene.train):
         camera = scene.cameras[name]
         masks = [scene.mask(name, t) for t in range(scene.n_frames)]
-        ever = np.any(masks, axis=0)
+        ever = functools.reduce(np.logical_or, masks)
         if not ever.any():
             continue
         x0, y0, x1, y1 = _extent(ever, MASK_MARGIN)
         crop_area = float((x1 - x0) * (y1 - y0))
         eye = torch.tensor(camera.center, dtype=torch.float32)
         for t, mask in enumerate(masks):
-            if not mask.any() or len(positions[t]) == 0:
+            if not mask.any() or len(positions[t]) == 0 or (trusted is not None and not trusted[t, view]):
                 continue
             box = _extent(mask, MASK_MARGIN)
             x0, y0, x1, y1 = _window(camera, box, positions[t])
-            inner = (slice(box[1] - y0, box[3] - y0), slice(box[0] - x0, box[2] - x0))
+            part = slice(box[1], box[3]), slice(box[0], box[2])
+            photograph = Photograph(
+                torch.from_numpy(scene.image(name, t)[part].copy()),
+                torch.from_numpy(mask[part].copy()),
+                top=box[1] - y0,
+                left=box[0] - x0,
+            )
             targets.append(
                 Target(
                     frame=t,
                     camera=camera.cropped(x0, y0, x1 - x0, y1 - y0),
                     eye=eye,
-                    image=torch.from_numpy(scene.image(name, t)[y0:y1, x0:x1].copy()),
-                    mask=torch.from_numpy(mask[y0:y1, x0:x1].copy()),
+                    photograph=photograph,
                     background=torch.from_numpy(backgrounds[name])[y0:y1, x0:x1],
-                    box=inner,
                     area=crop_area if silhouette_norm == "image" else float(mask.sum()),
+                    hidden=None if hidden is None else torch.from_numpy(hidden(name, positions[t])),
                 )
             )
     return targets

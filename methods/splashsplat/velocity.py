@@ -21,6 +21,8 @@ from scipy.ndimage import gaussian_filter
 
 from splashbench.parallel import over_range
 
+_SMALL_LOOP = 1024
+
 
 @dataclass(frozen=True)
 class VelocitySettings:
@@ -67,6 +69,23 @@ def velocity_at(control: np.ndarray, factor: int, x: float, y: float, z: float) 
                 v += weight * control[i + di, j + dj, k + dk, 1]
                 w += weight * control[i + di, j + dj, k + dk, 2]
     return u, v, w
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _velocities_at(
+    control: np.ndarray, factor: int, positions: np.ndarray, velocities: np.ndarray, start: int, stop: int
+) -> None:
+    for n in range(start, stop):
+        u, v, w = velocity_at(control, factor, positions[n, 0], positions[n, 1], positions[n, 2])
+        velocities[n, 0], velocities[n, 1], velocities[n, 2] = u, v, w
+
+
+def velocities_at(control: np.ndarray, factor: int, positions: np.ndarray) -> np.ndarray:
+    """u at transport-grid `positions` [N, 3], float64 [N, 3], voxels per frame; control, factor: see `velocity_at`."""
+    velocities = np.empty((len(positions), 3))
+    control, positions = np.ascontiguousarray(control, np.float32), np.ascontiguousarray(positions, np.float64)
+    over_range(_velocities_at, len(positions), control, factor, positions, velocities, smallest=_SMALL_LOOP)
+    return velocities
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -21,7 +21,7 @@ from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import raise_if_disk_full, read_model, write_model
 from splashbench.processes import end_with_parent
-from splashbench.scene import Camera, Particles, Scene, TrainingScene
+from splashbench.scene import Camera, Particles, Scene, SignedDistance, TrainingScene
 from splashbench.submission import Status, to_8bit, write_view
 from splashbench.submission.exr import write_exr
 
@@ -90,15 +90,18 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
             device=request.device,
             directory=Path(request.scratch),
             budget_seconds=request.budget_seconds,
+            cache=Path(request.cache) if request.cache else None,
             _report=_reporter(stream),
         )
         start = time.perf_counter()
         fitted = method.fit(scene, config, run)
         _synchronise()
-        seconds = time.perf_counter() - start
+        seconds = run.fit_seconds(time.perf_counter() - start)
     fitted.save(Path(request.model))
     return Outcome(
         seconds=seconds,
+        reused=run.reused,
+        stages=run.stages,
         settings=config.model_dump(mode="json"),
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),
@@ -134,6 +137,10 @@ def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
             raise Failure(Status.INCOMPLETE, f"particles cover {particles.n_frames} of {scene.n_frames} timesteps")
         _check_finite(particles)
         particles.save(output / "particles.npz")
+    geometry = fitted.signed_distance()
+    if geometry is not None:
+        _check_geometry(geometry, scene.n_frames)
+        geometry.save(output / "geometry.npz")
     known = [count for count in counts if count is not None]
     return Outcome(
         render_fps=_frame_rate(fitted, scene, request.timing_frames),
@@ -170,6 +177,13 @@ def _check_finite(particles: Particles) -> None:
         values = getattr(particles, name)
         if values is not None and not np.isfinite(values).all():
             raise Failure(Status.NOT_FINITE, f"particles: {name} has NaN or infinite entries")
+
+
+def _check_geometry(geometry: SignedDistance, n_frames: int) -> None:
+    if not isinstance(geometry, SignedDistance):
+        raise Failure(Status.INCOMPLETE, f"signed_distance() returned {type(geometry).__name__}, not a SignedDistance")
+    if geometry.n_frames != n_frames:
+        raise Failure(Status.INCOMPLETE, f"the signed distance covers {geometry.n_frames} of {n_frames} timesteps")
 
 
 def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | None:

@@ -7,18 +7,22 @@ memory into a recorded status. CONTRIBUTING.md shows a complete method in one fi
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from splashbench.errors import SplashbenchError
-from splashbench.scene import Camera, Particles, TrainingScene
+from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,19 @@ class Run:
         device: "cpu", or a device the method's framework knows, such as "cuda".
         directory: scratch space, removed after the run.
         budget_seconds: the time after which the harness stops the fit, or None. A method may use less.
+        cache: a folder for parts that runs of one study share, see `reuse`; None in ordinary runs.
+        reused: parts that came from there, and the seconds their fit took in an earlier run.
+        stages: seconds of the fit's stages, see `stage`.
     """
 
     seed: int = 0
     device: str = "cpu"
     directory: Path = Path()
     budget_seconds: float | None = None
+    cache: Path | None = None
+    reused: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, float] = field(default_factory=dict)
+    _overhead_seconds: float = 0.0
     _report: Callable[[float, str], None] | None = None
     _checkpoint: Callable[[Fitted], None] | None = None
 
@@ -65,10 +76,49 @@ class Run:
         if self._report is not None:
             self._report(float(fraction), message)
 
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the wall time of what is within as the stage `name`, for record.json; stages may come back."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+
     def checkpoint(self, fitted: Fitted) -> None:
         """Offer an intermediate state; where the harness collects them it saves it outside the clock."""
         if self._checkpoint is not None:
             self._checkpoint(fitted)
+
+    def reuse(
+        self,
+        name: str,
+        scene: TrainingScene,
+        key: Mapping[str, Any],
+        fit: Callable[[], T],
+        save: Callable[[T, Path], None],
+        load: Callable[[Path], T],
+    ) -> T:
+        """What `fit()` gives, or what it gave an earlier run of the same study, scene, key, seed and device.
+
+        For a part of the fit that does not depend on the rest, such as a frozen background `name`. `key` has every
+        setting and version the part depends on, in values that JSON has; `save` writes it into an empty folder and
+        `load` reads it from there, to the same bytes in renders. The harness adds the seconds of the earlier fit.
+        """
+        if self.cache is None:
+            return fit()
+        from splashbench.adapter.reuse import reuse
+
+        key = {**key, "seed": self.seed, "device": self.device}
+        part = reuse(self.cache, name, scene, key, fit, save, load)
+        self._overhead_seconds += part.overhead_seconds
+        if part.loaded_seconds is not None:
+            self.reused[name] = part.loaded_seconds
+        return part.value
+
+    def fit_seconds(self, wall_seconds: float) -> float:
+        """What a fit of `wall_seconds` would have taken by itself: with the fits of what it reused."""
+        return max(0.0, wall_seconds - self._overhead_seconds) + sum(self.reused.values())
 
 
 class MethodConfig(BaseModel):
@@ -102,6 +152,13 @@ class Fitted(ABC):
     @abstractmethod
     def particles(self) -> Particles | None:
         """The liquid's particles on the scene's timesteps in scene units, or None for a method without any."""
+
+    def signed_distance(self) -> SignedDistance | None:
+        """The liquid's signed distance on the scene's timesteps, in scene units, or None for a method without one.
+
+        It says where the liquid is, its inside included. Where there is none, that is told from the particles.
+        """
+        return None
 
     @abstractmethod
     def save(self, directory: Path) -> None:

@@ -33,6 +33,7 @@ class Request(BaseModel):
     progress: str
     timing_frames: int
     exr: bool
+    cache: str | None = None
 
 
 class Outcome(BaseModel):
@@ -42,6 +43,8 @@ class Outcome(BaseModel):
     status: Status = Status.OK
     reason: str = ""
     seconds: float | None = None
+    reused: dict[str, float] = {}
+    stages: dict[str, float] = {}
     render_fps: float | None = None
     timed_frames: int | None = None
     primitives_per_frame: float | None = None

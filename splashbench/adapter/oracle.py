@@ -1,7 +1,8 @@
 """The control `oracle`: the ground truth itself as a submission, written by the harness and marked as a control.
 
 No method sees a test image, so this is no method. It must score the perfect value on every image metric; where the
-scene has true particles they are handed in, else the particle metrics are null.
+scene has true particles they are handed in with the liquid they stand for, and score the perfect value against the
+truth; else the particle metrics are null.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from splashbench.adapter import hardware
+from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.progress import track
-from splashbench.scene import Scene
+from splashbench.scene import Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Submission, seal, write_view
 from splashbench.version import __version__
 
@@ -28,6 +30,9 @@ def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
         particles = scene.truth_particles()
         if particles is not None:
             particles.save(staging / "particles.npz")
+            geometry = _true_geometry(scene)
+            if geometry is not None:
+                geometry.save(staging / "geometry.npz")
         identity = Identity(
             method="oracle",
             preset="truth",
@@ -40,3 +45,14 @@ def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
         carriers = float(particles.active.sum(axis=1).mean()) if particles is not None else None
         seal(staging, identity, Record(carriers_per_frame=carriers))
     return Submission.open(out)
+
+
+def _true_geometry(scene: Scene) -> SignedDistance | None:
+    """The true liquid as the protocol defines it; None where the training masks give no hull, hence no grid."""
+    from splashbench.score.ground_truth import true_geometry
+    from splashbench.score.protocol import shared_fields
+
+    try:
+        return true_geometry(scene, shared_fields(scene)())
+    except SplashbenchError:
+        return None

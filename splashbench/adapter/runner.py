@@ -44,6 +44,7 @@ def run_method(
     replace: bool = False,
     keep_model: bool = True,
     exr: bool = False,
+    cache: Path | None = None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
 
@@ -54,6 +55,7 @@ def run_method(
         timing_frames: renders to time for frames per second; 0 leaves it out.
         keep_model: keep the fitted model under OUT/model, so that it can be rendered again.
         exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
+        cache: a folder for what the runs of one study share (adapter/reuse.py); the record says what came from there.
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
     """
@@ -103,6 +105,7 @@ def run_method(
                 progress=str(Path(scratch, "progress")),
                 timing_frames=timing_frames,
                 exr=exr,
+                cache=str(cache.resolve()) if cache else None,
             ),
         )
         if not keep_model or record.status != Status.OK:
@@ -110,7 +113,8 @@ def run_method(
         if record.status != Status.OK:
             for name_ in ("renders", "alpha", "exr"):
                 _remove_tree(staging / name_)
-            (staging / "particles.npz").unlink(missing_ok=True)
+            for name_ in ("particles.npz", "geometry.npz"):
+                (staging / name_).unlink(missing_ok=True)
         _require_unchanged(scene, method)
         seal(staging, identity, record)
     return Submission.open(out)
@@ -175,6 +179,8 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
             record = record.model_copy(
                 update={
                     "fit_seconds": outcome.seconds,
+                    "reused": outcome.reused,
+                    "stages": outcome.stages,
                     "storage_bytes": storage,
                     "dynamic_bytes": storage - static,
                 }

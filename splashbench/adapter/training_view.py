@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splashbench.files import write_model
 from splashbench.scene import Scene, SceneMeta
+from splashbench.scene.container import mesh_path
 
 
 def make_training_view(scene: Scene, directory: Path) -> Path:
@@ -29,6 +30,12 @@ def make_training_view(scene: Scene, directory: Path) -> Path:
         if container.is_file():
             _link(container, directory / container.relative_to(scene.directory))
     meta = scene.meta or SceneMeta(name=scene.name, times=None)
+    if meta.container_mesh is not None:
+        mesh = mesh_path(scene.directory, meta.container_mesh)
+        # Under a name of its own: made-up scenes keep it beside the truth, which a method is not shown.
+        meta = meta.model_copy(update={"container_mesh": f"container{mesh.suffix.lower()}"})
+        if mesh.is_file():
+            _link(mesh, directory / f"container{mesh.suffix.lower()}")
     sizes = {name: (camera.width, camera.height) for name, camera in scene.cameras.items()}
     times = scene.times.tolist() if scene.times_source != "nominal" else None
     write_model(directory / "scene.json", meta.model_copy(update={"sizes": sizes, "times": times, "provenance": {}}))

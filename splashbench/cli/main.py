@@ -20,7 +20,7 @@ from splashbench.processes import Terminated, terminable
 from splashbench.version import __version__
 
 #: In the order of the work: session, scene, method, submission, result.
-COMMANDS = ("demo", "synth", "prepare", "scene", "methods", "run", "check", "score", "leaderboard")
+COMMANDS = ("demo", "synth", "prepare", "scene", "methods", "run", "check", "score", "leaderboard", "study")
 
 _EPILOG = """\
 the usual order:
@@ -30,6 +30,7 @@ the usual order:
   splashbench run splashsplat SCENE SUBMISSION      reconstruct
   splashbench score SUBMISSION --scene SCENE --out RESULTS
   splashbench leaderboard RESULTS OUT               CSV, table and charts
+  splashbench study ablate ablation OUT --scenes SCENE...    many runs in one table
 """
 
 

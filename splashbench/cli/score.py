@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,10 @@ examples:
 Ground truth comes from SCENE alone. A run that failed becomes a result with its status and no score. --reference, the
 submission of the control `nothing` on the same scene, gives dpsnr_bg and spill_rgb. LPIPS needs weights: the option,
 the environment variable SPLASHBENCH_LPIPS_WEIGHTS, or an installed lpips package with torchvision's AlexNet cached;
-without them it is null.
+without them it is null. Where SCENE is made up and has true particles, geometry and motion are compared with them.
 """
 
-# The figures of the small table; the result has all of them.
+# The figures of the small table; the result has all of them. Those against true particles have a table of their own.
 _SHOWN = ("psnr", "dpsnr_bg", "ssim", "lpips", "miou", "spill", "jitter_error", "uniformity", "delta_e", "fit_seconds")
 
 
@@ -123,19 +124,19 @@ def _protocol(changes: list[str]) -> Protocol:
 def _summary(results: list[Result]) -> str:
     from splashbench.errors import one_line
     from splashbench.score import METRICS
-    from splashbench.score.metrics import format_value
+    from splashbench.score.metrics import TRUTH_METRICS
 
-    rows = []
-    for result in results:
-        cells = [format_value(name, result.value(name), "-") for name in _SHOWN]
-        rows.append([result.method, str(result.seed), result.status, *cells])
-    lines = [table(["method", "seed", "status", *(METRICS[name].label for name in _SHOWN)], rows)]
+    lines = [_figures(results, _SHOWN)]
+    with_truth = [result for result in results if result.digests.truth is not None]
+    if with_truth:
+        lines += ["against the true particles:", _figures(with_truth, TRUTH_METRICS)]
     missing = {
         f"{name}: {metric.reason}"
         for result in results
         if result.status == "ok"
         for name, metric in result.metrics.items()
         if metric.value is None and METRICS[name].group != "cost"
+        if name not in TRUTH_METRICS or result.digests.truth is not None
     }
     lines += [f"null {reason}" for reason in sorted(missing)]
     lines += [
@@ -144,3 +145,15 @@ def _summary(results: list[Result]) -> str:
         if result.status != "ok"
     ]
     return "\n".join(lines)
+
+
+def _figures(results: list[Result], names: Sequence[str]) -> str:
+    """A table with a row per result and a column per metric of `names`."""
+    from splashbench.score import METRICS
+    from splashbench.score.metrics import format_value
+
+    rows = []
+    for result in results:
+        cells = [format_value(name, result.value(name), "-") for name in names]
+        rows.append([result.method, str(result.seed), result.status, *cells])
+    return table(["method", "seed", "status", *(METRICS[name].label for name in names)], rows)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from splashbench.cli.output import add_json, emit, say, table
+from splashbench.errors import SplashbenchError
 
 _EPILOG = """\
 examples:
@@ -25,11 +27,19 @@ _SCENE_EPILOG = """\
 examples:
   splashbench synth scene balls scenes/balls                 a second; balls in free flight, to try a method on
   splashbench synth scene opaque_bowl scenes/opaque_bowl     minutes; a simulated pour
+  splashbench synth scene glass_tank scenes/tank --step 33 --timesteps 20
+
+scenes, and the time between their frames:
+  balls        balls in free flight, 8 frames within a third of a second
+  opaque_bowl  a pour that splashes in an opaque bowl, 33 ms
+  glass_tank   a pour into a glass tank, seen through its walls, 50 to 83 ms, uneven as in real captures
+  thin_stream  a stream a centimetre thick, 40 ms
+  still_pool   a pool coming to rest, 100 ms
 """
 # The names of splashbench.synth.scenes.RECIPES, repeated here so that `--help` need not import them, and the scene
 # that needs no simulation.
 _BALLS = "balls"
-_SCENES = (_BALLS, "opaque_bowl", "thin_stream", "still_pool")
+_SCENES = (_BALLS, "opaque_bowl", "glass_tank", "thin_stream", "still_pool")
 _LONGEST_SIDE = 8192
 _VERIFY_EPILOG = """\
 example:
@@ -91,8 +101,11 @@ def _register_scene(kinds: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("name", choices=_SCENES, metavar="NAME", help=f"one of {', '.join(_SCENES)}")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder to be made")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="of frames (default: 480x270; balls: 96x64)")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="of frames (default: 480x320; balls: 96x64)")
     parser.add_argument("--timesteps", type=_positive, metavar="N", help="frames per camera (default: 50; balls: 8)")
+    parser.add_argument(
+        "--step", type=_milliseconds, metavar="MS", help="between frames, all alike (default: as fits the scene)"
+    )
     parser.add_argument(
         "--particle-radius", type=float, metavar="METRES", help="of the simulation (default: as fits the scene)"
     )
@@ -133,6 +146,16 @@ def _positive(text: str) -> int:
     return int(text)
 
 
+def _milliseconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of milliseconds above 0")
+    return value
+
+
 def _not_negative(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
@@ -161,6 +184,9 @@ def run_session(arguments: argparse.Namespace) -> int:
 def run_scene(arguments: argparse.Namespace) -> int:
     """Handle `splashbench synth scene`."""
     if arguments.name == _BALLS:
+        for option, value in (("--step", arguments.step), ("--particle-radius", arguments.particle_radius)):
+            if value is not None:
+                raise SplashbenchError(f"{option} is for simulated scenes, and balls is not one; leave it out")
         from splashbench.synth.balls import write_balls_scene
 
         scene = write_balls_scene(
@@ -171,15 +197,16 @@ def run_scene(arguments: argparse.Namespace) -> int:
             replace=arguments.replace,
         )
     else:
-        from splashbench.synth.scenes import make_scene
+        from splashbench.synth.scenes import DEFAULT_SIZE, make_scene
 
         scene = make_scene(
             arguments.name,
             arguments.out,
-            size=arguments.size or (480, 270),
+            size=arguments.size or DEFAULT_SIZE,
             timesteps=arguments.timesteps or 50,
             seed=arguments.seed,
             particle_radius=arguments.particle_radius,
+            step_ms=arguments.step,
             replace_existing=arguments.replace,
         )
     if arguments.json:
@@ -190,7 +217,6 @@ def run_scene(arguments: argparse.Namespace) -> int:
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Handle `splashbench synth verify`."""
-    from splashbench.errors import SplashbenchError
     from splashbench.files import write_model
     from splashbench.synth.verify import verify_scene
 

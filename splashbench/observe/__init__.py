@@ -3,8 +3,10 @@
 Needs no torch. The kernels are compiled at first use (a few seconds) and cached.
 """
 
+from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import sequence_bounds
+from splashbench.observe.shadow import ContainerShadow
 from splashbench.observe.signed_distance import (
     SignedDistanceFields,
     signed_distance_fields,
@@ -14,9 +16,11 @@ from splashbench.observe.silhouettes import Silhouettes
 
 __all__ = [
     "Bounds",
+    "ContainerShadow",
     "Grid",
     "SignedDistanceFields",
     "Silhouettes",
+    "distrust_failed_masks",
     "sequence_bounds",
     "signed_distance_fields",
     "signed_distance_frames",

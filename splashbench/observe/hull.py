@@ -2,6 +2,7 @@
 
 phi(x) = max over views of s_v(pi_v(x)) z_v(x) / f_v, with s_v the 2-D signed distance in pixels to the view's
 silhouette: positive as soon as one view contradicts x, sub-voxel sharp, and without a 3-D distance transform.
+A container adds where its walls are, and which views see x at all (shadow.py).
 """
 
 from __future__ import annotations
@@ -13,37 +14,67 @@ import numpy as np
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.kernels import carve_view
-from splashbench.observe.silhouettes import MaskedScene, Silhouettes
+from splashbench.observe.shadow import LIMIT_VOXELS, CarvingContainer, ContainerShadow, focal_length
+from splashbench.observe.silhouettes import MaskedScene, Silhouettes, Window
 
-#: phi is clipped to this many voxels: nothing farther from the interface matters to transport, carriers or opacity
-LIMIT_VOXELS = 20.0
 SEARCH_CELLS = 64
 REFINED_CELLS = 96
 
+#: the 2-D signed distance s_v of view number v, of a window of its image
+Distance = Callable[[int, Window | None], np.ndarray]
 
-def carve(silhouettes: Silhouettes, grid: Grid, distance: Callable[[int], np.ndarray]) -> np.ndarray:
-    """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance(view)` gives s_v."""
-    phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32)
-    for view, camera in enumerate(silhouettes.cameras):
-        focal = 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
-        carve_view(
-            phi,
-            grid.origin,
-            grid.voxel,
-            np.ascontiguousarray(camera.projection),
-            focal,
-            distance(view),
-            silhouettes.corners[view],
-            LIMIT_VOXELS,
-        )
+
+def carve(
+    silhouettes: Silhouettes, grid: Grid, distance: Distance, container: CarvingContainer | None = None
+) -> np.ndarray:
+    """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v."""
+    phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32) if container is None else container.outside.copy()
+    for view in range(len(silhouettes.cameras)):
+        _carve_with(phi, silhouettes, grid, view, distance, container)
     return phi
 
 
-def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int) -> np.ndarray:
+def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingContainer | None = None) -> np.ndarray:
     """Hull distance of frame `t` (see `carve`); LIMIT_VOXELS everywhere in a frame without liquid."""
     if not silhouettes.has_liquid(t):
         return np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
-    return carve(silhouettes, grid, lambda view: silhouettes.distance(view, t))
+    return carve(silhouettes, grid, lambda view, window: silhouettes.distance(view, t, window), container)
+
+
+def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingContainer | None = None) -> np.ndarray:
+    """What each view alone is certain of in frame `t`: float32 [V, nx, ny, nz] in voxels, < 0 in its silhouette."""
+    each = np.full((len(silhouettes.cameras), *grid.shape), -LIMIT_VOXELS, dtype=np.float32)
+    for view, phi in enumerate(each):
+        _carve_with(
+            phi, silhouettes, grid, view, lambda v, window: silhouettes.certain_distance(v, t, window), container
+        )
+    return each
+
+
+def _carve_with(
+    phi: np.ndarray,
+    silhouettes: Silhouettes,
+    grid: Grid,
+    view: int,
+    distance: Distance,
+    container: CarvingContainer | None,
+) -> None:
+    """phi = max(phi, what view number `view` says), in place."""
+    if container is not None and container.views:
+        shadow = container.views[view]
+        shadow.carve(phi, grid, shadow.evidence(distance(view, shadow.window)))
+        return
+    camera = silhouettes.cameras[view]
+    carve_view(
+        phi,
+        grid.origin,
+        grid.voxel,
+        camera.projection,
+        focal_length(camera),
+        distance(view, None),
+        silhouettes.windows[view].corner,
+        LIMIT_VOXELS,
+    )
 
 
 def _inside(phi: np.ndarray, grid: Grid, tolerance: float) -> Bounds | None:
@@ -59,10 +90,11 @@ def _inside(phi: np.ndarray, grid: Grid, tolerance: float) -> Bounds | None:
 def _meeting_point(silhouettes: Silhouettes) -> np.ndarray:
     """Point closest to all rays through the middles of what each view ever sees as liquid, [3] scene units."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    for camera, mask, corner in zip(silhouettes.cameras, silhouettes.sequence_masks, silhouettes.corners):
-        if not mask.any():
+    for view, camera in enumerate(silhouettes.cameras):
+        rows, columns = np.nonzero(silhouettes.sequence_mask(view))
+        if len(rows) == 0:
             continue
-        rows, columns = np.nonzero(mask)
+        corner = silhouettes.windows[view].corner
         pixel = np.array([columns.mean() + 0.5 + corner[0], rows.mean() + 0.5 + corner[1], 1.0])
         direction = camera.w2c[:3, :3].T @ np.linalg.solve(camera.K, pixel)
         direction /= np.linalg.norm(direction)
@@ -72,8 +104,10 @@ def _meeting_point(silhouettes: Silhouettes) -> np.ndarray:
     return np.linalg.lstsq(normal, right, rcond=None)[0]
 
 
-def sequence_bounds(scene: MaskedScene | Silhouettes) -> Bounds:
+def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerShadow | None = None) -> Bounds:
     """Box around the union of the hulls of all frames, scene units, without padding.
+
+    container: where given, the box leaves out what it does not allow, and holds what it may hide.
 
     Raises SplashbenchError when the masks of the views have no common hull (wrong cameras, or masks of another scene).
     """
@@ -88,7 +122,8 @@ def sequence_bounds(scene: MaskedScene | Silhouettes) -> Bounds:
     # First what all frames together allow: no frame's liquid can lie outside it, and it costs one carving only.
     for _ in range(3):
         grid = Grid.over(bounds, SEARCH_CELLS)
-        common = _inside(carve(silhouettes, grid, silhouettes.sequence_distance), grid, tolerance=1.0)
+        carving = None if container is None else CarvingContainer(container, silhouettes, grid)
+        common = _inside(carve(silhouettes, grid, silhouettes.sequence_distance, carving), grid, tolerance=1.0)
         if common is None:
             raise SplashbenchError(
                 "the liquid masks of the training views have no common visual hull; "
@@ -96,9 +131,10 @@ def sequence_bounds(scene: MaskedScene | Silhouettes) -> Bounds:
             )
         bounds = common
     grid = Grid.over(bounds.padded(0.02), REFINED_CELLS)
+    carving = None if container is None else CarvingContainer(container, silhouettes, grid)
     nearest = np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
     for t in range(silhouettes.n_frames):
-        np.minimum(nearest, carve_frame(silhouettes, grid, t), out=nearest)
+        np.minimum(nearest, carve_frame(silhouettes, grid, t, carving), out=nearest)
     # Streams thinner than a voxel may fall between the nodes, hence the tolerance.
     refined = _inside(nearest, grid, tolerance=0.5)
     return bounds if refined is None else refined

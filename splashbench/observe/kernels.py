@@ -145,3 +145,112 @@ def carve_view(
         np.ascontiguousarray(corner, np.float64),
         float(limit),
     )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _carve_hidden_view(
+    phi: np.ndarray,
+    witnesses: np.ndarray,
+    origin: np.ndarray,
+    voxel: float,
+    projection: np.ndarray,
+    focal: float,
+    layers: np.ndarray,
+    corner: np.ndarray,
+    nearest: np.ndarray,
+    starts: np.ndarray,
+    tolerance: float,
+    limit: float,
+    start: int,
+    stop: int,
+) -> None:
+    _, ny, nz = phi.shape
+    last, height, width = layers.shape[0] - 1, layers.shape[1], layers.shape[2]
+    counting = witnesses.shape[1] > 0
+    for i in range(start, stop):
+        x = origin[0] + i * voxel
+        for j in range(ny):
+            y = origin[1] + j * voxel
+            for k in range(nz):
+                if not counting and phi[i, j, k] >= limit:
+                    continue
+                z = origin[2] + k * voxel
+                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+                if depth <= 0.0:
+                    if not counting:
+                        phi[i, j, k] = limit
+                    continue
+                u = projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]
+                v = projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]
+                u = u / depth - 0.5 - corner[0]
+                v = v / depth - 0.5 - corner[1]
+                inside_u = min(max(u, 0.0), width - 1.0)
+                inside_v = min(max(v, 0.0), height - 1.0)
+                beyond = np.sqrt((u - inside_u) ** 2 + (v - inside_v) ** 2)
+                reach = depth - tolerance
+                layer = 0
+                while layer < last and starts[layer] <= reach:
+                    layer += 1
+                # The nearest layer that hides no more than is hidden at this depth, or no less: either keeps the sign.
+                if beyond == 0.0 and nearest[int(inside_v + 0.5), int(inside_u + 0.5)] < reach and layer < last:
+                    layer += 1
+                column = min(int(inside_u), width - 2)
+                row = min(int(inside_v), height - 2)
+                a = inside_u - column
+                b = inside_v - row
+                image = layers[layer]
+                pixels = (image[row, column] * (1 - a) + image[row, column + 1] * a) * (1 - b) + (
+                    image[row + 1, column] * (1 - a) + image[row + 1, column + 1] * a
+                ) * b
+                distance = min(max((pixels + beyond) * depth / (focal * voxel), -limit), limit)
+                if not counting:
+                    phi[i, j, k] = max(phi[i, j, k], distance)
+                elif distance > phi[i, j, k]:
+                    witnesses[i, j, k] = phi[i, j, k]
+                    phi[i, j, k] = distance
+                elif distance > witnesses[i, j, k]:
+                    witnesses[i, j, k] = distance
+
+
+_NOT_COUNTING = np.zeros((1, 0, 1), dtype=np.float32)
+
+
+def carve_hidden_view(
+    phi: np.ndarray,
+    origin: np.ndarray,
+    voxel: float,
+    projection: np.ndarray,
+    focal: float,
+    layers: np.ndarray,
+    corner: np.ndarray,
+    nearest: np.ndarray,
+    starts: np.ndarray,
+    tolerance: float,
+    limit: float,
+    second: np.ndarray | None = None,
+) -> None:
+    """As `carve_view`, for a view from which an occluder hides what lies more than `tolerance` behind it.
+
+    layers: float32 [K + 1, h, w], signed distances in pixels of the evidence at growing depths; layer k counts for
+    depths from starts[k - 1] on (starts: [K], scene units, rising). nearest: float32 [h, w], depth of the occluder. A
+    point that is hidden at its own depth looks one layer deeper, where its pixel is hidden too.
+
+    second: float32 [nx, ny, nz]; where given, phi collects the largest and `second` the second largest value of all
+    views that are added one after the other, instead of the maximum alone.
+    """
+    over_range(
+        _carve_hidden_view,
+        phi.shape[0],
+        phi,
+        _NOT_COUNTING if second is None else second,
+        np.ascontiguousarray(origin, np.float64),
+        float(voxel),
+        np.ascontiguousarray(projection, np.float64),
+        float(focal),
+        np.ascontiguousarray(layers, np.float32),
+        np.ascontiguousarray(corner, np.float64),
+        np.ascontiguousarray(nearest, np.float32),
+        np.ascontiguousarray(starts, np.float64),
+        float(tolerance),
+        float(limit),
+    )

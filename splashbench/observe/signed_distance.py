@@ -12,9 +12,11 @@ from typing import Literal
 
 import numpy as np
 
+from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.grid import Bounds, Grid
-from splashbench.observe.hull import LIMIT_VOXELS, carve_frame, sequence_bounds
+from splashbench.observe.hull import carve_frame, sequence_bounds
 from splashbench.observe.kernels import sample
+from splashbench.observe.shadow import LIMIT_VOXELS, CarvingContainer, ContainerShadow
 from splashbench.observe.silhouettes import MaskedScene, Silhouettes
 
 DistanceMethod = Literal["silhouette", "carve"]
@@ -65,11 +67,18 @@ def signed_distance_of(occupied: np.ndarray) -> np.ndarray:
 
 
 def signed_distance_frames(
-    silhouettes: Silhouettes, grid: Grid, method: DistanceMethod = "silhouette"
+    silhouettes: Silhouettes,
+    grid: Grid,
+    method: DistanceMethod = "silhouette",
+    container: ContainerShadow | None = None,
 ) -> Iterator[np.ndarray]:
-    """phi of one frame after another on `grid`, float32 [nx, ny, nz] in voxels: no more than one frame in memory."""
+    """phi of one frame after another on `grid`, float32 [nx, ny, nz] in voxels: no more than one frame in memory.
+
+    container: where given, no liquid is in its walls, and what it hides from a view is not held against the liquid.
+    """
+    carving = None if container is None else CarvingContainer(container, silhouettes, grid)
     for t in range(silhouettes.n_frames):
-        phi = carve_frame(silhouettes, grid, t)
+        phi = carve_frame(silhouettes, grid, t, carving)
         yield phi if method == "silhouette" else signed_distance_of(phi < 0)
 
 
@@ -78,13 +87,19 @@ def signed_distance_fields(
     cells_longest_axis: int = 96,
     views: Sequence[str] | None = None,
     method: DistanceMethod = "silhouette",
+    container: ContainerShadow | None = None,
+    find_failures: bool = False,
 ) -> SignedDistanceFields:
     """phi of all frames from the masks of `views` (all training views by default).
 
     The grid spans the box around the hulls of all frames with 10% padding, with `cells_longest_axis` cubic cells
-    along its longest side. Raises SplashbenchError when the masks have no common hull.
+    along its longest side. container: see `signed_distance_frames`. find_failures: whether masks that miss large parts
+    of the liquid are looked for and replaced (failures.py). Raises SplashbenchError when the masks have no common hull.
     """
     silhouettes = Silhouettes(scene, views)
-    bounds = sequence_bounds(silhouettes)
+    if find_failures:
+        distrust_failed_masks(silhouettes, container)
+    bounds = sequence_bounds(silhouettes, container)
     grid = Grid.over(bounds.padded(PADDING), cells_longest_axis)
-    return SignedDistanceFields(grid, bounds, np.stack(list(signed_distance_frames(silhouettes, grid, method))))
+    frames = list(signed_distance_frames(silhouettes, grid, method, container))
+    return SignedDistanceFields(grid, bounds, np.stack(frames))

@@ -36,7 +36,8 @@ def threads(count: int) -> Iterator[None]:
         _threads = before
 
 
-def _thread_count() -> int:
+def kernel_threads() -> int:
+    """On how many threads the kernel works now."""
     return min(_threads or thread_count(), native.MAX_THREADS)
 
 
@@ -128,7 +129,7 @@ class Rendering:
         into = native.Gradients(int(add_to is not None), *map(_address, gradients))
         backward = native.library().splash_backward
         with self.handle.lock:
-            status = backward(self.handle.frame, *map(_address, outer), _thread_count(), ctypes.byref(into))
+            status = backward(self.handle.frame, *map(_address, outer), kernel_threads(), ctypes.byref(into))
         _raise_for(status, self.gaussians)
         return gradients  # type: ignore[return-value]
 
@@ -180,7 +181,7 @@ def freeze(means: Any, factors: Any, opacities: Any, colors: Any, camera: Camera
     gaussians = native.Gaussians(len(arrays[0]), gaussians.channels, *map(_address, arrays))
     handle = _Handle(arrays)
     status = native.library().splash_freeze(
-        ctypes.byref(_camera(camera)), ctypes.byref(gaussians), int(depth), _thread_count(), ctypes.byref(handle.frame)
+        ctypes.byref(_camera(camera)), ctypes.byref(gaussians), int(depth), kernel_threads(), ctypes.byref(handle.frame)
     )
     _raise_for(status, arrays)
     return Frozen(camera, arrays, depth, handle)
@@ -237,7 +238,7 @@ def forward(
         ctypes.byref(gaussians),
         ctypes.byref(output),
         None if frozen is None else frozen.handle.frame,
-        _thread_count(),
+        kernel_threads(),
         ctypes.byref(handle.frame),
     )
     _raise_for(status, arrays)

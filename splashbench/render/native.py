@@ -10,13 +10,13 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from ctypes import POINTER, Structure, c_char_p, c_double, c_int32, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_double, c_float, c_int32, c_int64, c_void_p
 from functools import lru_cache
 from pathlib import Path
 
 from splashbench.errors import SplashbenchError
 
-ABI_VERSION = 1
+ABI_VERSION = 2
 MAX_CHANNELS = 32
 MAX_THREADS = 64
 
@@ -80,6 +80,89 @@ class Gradients(Structure):
     )
 
 
+class Heads(Structure):
+    """SplashHeads."""
+
+    _fields_ = (
+        ("features", c_int32),
+        ("children", c_int32),
+        ("hidden", c_int32),
+        ("offset_bound", c_float),
+        ("scale_range", c_float),
+        ("opacity_slope", c_float),
+        ("opacity_band", c_float),
+        ("separation_margin", c_float),
+        ("weights", c_void_p * 10),
+    )
+
+
+class Carriers(Structure):
+    """SplashCarriers."""
+
+    _fields_ = (
+        ("count", c_int64),
+        ("rows", c_void_p),
+        ("features", c_void_p),
+        ("log_scales", c_void_p),
+        ("positions", c_void_p),
+        ("deformation", c_void_p),
+        ("phi", c_void_p),
+        ("visibility", c_void_p),
+        ("eye", c_float * 3),
+        ("cells", c_void_p),
+        ("cell_count", c_int64),
+    )
+
+
+class Children(Structure):
+    """SplashChildren."""
+
+    _fields_ = (
+        ("means", c_void_p),
+        ("factors", c_void_p),
+        ("opacities", c_void_p),
+        ("colors", c_void_p),
+        ("offsets", c_void_p),
+    )
+
+
+class DecoderGradients(Structure):
+    """SplashDecoderGradients."""
+
+    _fields_ = (("features", c_void_p), ("log_scales", c_void_p), ("weights", c_void_p * 10))
+
+
+class RowAdam(Structure):
+    """SplashRowAdam."""
+
+    _fields_ = (
+        ("table", c_void_p),
+        ("first", c_void_p),
+        ("second", c_void_p),
+        ("steps", c_void_p),
+        ("width", c_int64),
+        ("corrections", c_void_p),
+        ("beta1", c_double),
+        ("beta2", c_double),
+        ("epsilon", c_double),
+    )
+
+
+class Window(Structure):
+    """SplashWindow."""
+
+    _fields_ = (
+        ("width", c_int32),
+        ("height", c_int32),
+        ("left", c_int32),
+        ("top", c_int32),
+        ("columns", c_int32),
+        ("rows", c_int32),
+        ("truth", c_void_p),
+        ("mask", c_void_p),
+    )
+
+
 def _open(path: Path) -> ctypes.CDLL:
     try:
         library = ctypes.CDLL(os.fspath(path))
@@ -104,6 +187,30 @@ def _open(path: Path) -> ctypes.CDLL:
         "splash_release": (None, (frame,)),
         "splash_frame_bytes": (c_int64, (frame,)),
         "splash_frame_counts": (None, (frame, c_int64 * 3)),
+        "splash_decode_kept": (c_int64, (POINTER(Heads), c_int64)),
+        "splash_decode": (
+            c_int32,
+            (POINTER(Heads), POINTER(Carriers), POINTER(Children), c_void_p, c_void_p, c_double * 3, c_int32),
+        ),
+        "splash_decode_backward": (
+            c_int32,
+            (
+                POINTER(Heads),
+                POINTER(Carriers),
+                c_void_p,
+                c_void_p,
+                POINTER(Children),
+                c_double * 3,
+                c_int32,
+                POINTER(DecoderGradients),
+            ),
+        ),
+        "splash_adam_rows": (None, (POINTER(RowAdam), c_int64, c_void_p, c_void_p, c_float, c_int32)),
+        "splash_window_losses": (c_int32, (POINTER(Window), c_void_p, c_void_p, c_double * 3, c_int32)),
+        "splash_window_gradients": (
+            c_int32,
+            (POINTER(Window), c_void_p, c_void_p, c_double * 3, c_void_p, c_void_p, c_int32),
+        ),
         "splash_trim": (None, ()),
         "splash_variant": (c_char_p, ()),
         "splash_best_variant": (c_char_p, ()),

@@ -16,16 +16,19 @@ from statistics import median
 
 from splashbench.files import write_text
 from splashbench.report.results import Source, hardware_label, settings_digest
-from splashbench.score.metrics import METRICS, format_value
+from splashbench.score.metrics import METRICS, TRUTH_METRICS, format_value
 from splashbench.score.result import Result
 
-_SPREAD = tuple(name for name, metric in METRICS.items() if metric.group != "cost" or name == "fit_seconds")
+_FIGURES = tuple(name for name in METRICS if name not in TRUTH_METRICS)
+_SPREAD = tuple(name for name in _FIGURES if METRICS[name].group != "cost" or name == "fit_seconds")
 CSV_COLUMNS = (
     *("method", "scene", "seed", "preset", "status", "reason"),
-    *METRICS,
+    *_FIGURES,
     *("control", "mixed", "runs"),
     *(f"{name}_spread" for name in _SPREAD),
     *("method_version", "settings_digest", "protocol", "scene_digest", "hardware"),
+    *TRUTH_METRICS,
+    *(f"{name}_spread" for name in TRUTH_METRICS),
 )
 
 
@@ -101,11 +104,13 @@ def to_csv(rows: Sequence[Row]) -> str:
         writer.writerow(
             [
                 *(run.method, run.scene, _seeds(row), run.preset, run.status, run.reason),
-                *(format_value(name, row.value(name)) for name in METRICS),
+                *(format_value(name, row.value(name)) for name in _FIGURES),
                 *(str(run.control).lower(), str(run.mixed).lower(), len(row.runs)),
                 *(format_value(name, row.spread(name)) for name in _SPREAD),
                 *(run.method_version, settings_digest(run), run.protocol.label, run.digests.scene),
                 hardware_label(run.hardware),
+                *(format_value(name, row.value(name)) for name in TRUTH_METRICS),
+                *(format_value(name, row.spread(name)) for name in TRUTH_METRICS),
             ]
         )
     return stream.getvalue()

@@ -9,7 +9,7 @@ from statistics import fmean
 
 from splashbench.report.leaderboard import Row, table_of
 from splashbench.report.results import Source, hardware_label, settings_digest
-from splashbench.score.metrics import METRICS, format_value
+from splashbench.score.metrics import METRICS, TRUTH_METRICS, format_value
 
 _QUALITY = (
     *("psnr", "dpsnr_bg", "ssim", "ssim_fg", "lpips", "miou", "spill", "spill_rgb", "jitter_error"),
@@ -40,7 +40,9 @@ def to_markdown(rows: Sequence[Row], sources: Sequence[Source]) -> str:
         "of the scene, controls aside. *Italic* rows are controls: yardsticks, not reconstructions.",
     ]
     for (scene, digest, protocol), group in groupby(rows, key=table_of):
-        parts += [f"## {scene} (protocol {protocol}, scene {digest[:8]})", _scene_table(list(group), letters)]
+        members = list(group)
+        parts += [f"## {scene} (protocol {protocol}, scene {digest[:8]})", _scene_table(members, letters)]
+        parts += _truth_table(members)
     parts += _means(rows, letters)
     parts += ["## Hardware", _bullets(f"{letters[machine]}: {_one_line(machine)}" for machine in machines)]
     parts += _failures(rows) + _claims(rows) + _nulls(rows)
@@ -66,6 +68,21 @@ def _scene_table(rows: list[Row], letters: dict[str, str]) -> str:
         cells += [_cost_cell(row, name) for name in _COST]
         lines.append([*cells, letters[hardware_label(run.hardware)]])
     return _joined(lines)
+
+
+def _truth_table(rows: list[Row]) -> list[str]:
+    """The figures against true particles, where the scene has them."""
+    known = [row for row in rows if any(row.value(name) is not None for name in TRUTH_METRICS)]
+    if not known:
+        return []
+    best = {name: _best(name, known) for name in TRUTH_METRICS}
+    header = ["Method", "Preset", "Seeds", *(METRICS[name].label for name in TRUTH_METRICS)]
+    lines = [header, ["---"] * 3 + ["---:"] * len(TRUTH_METRICS)]
+    for row in known:
+        method = f"*{row.first.method}*" if row.first.control else row.first.method
+        cells = [method, _preset(row, rows), " ".join(str(run.seed) for run in row.runs)]
+        lines.append([*cells, *(_quality_cell(row, name, best[name]) for name in TRUTH_METRICS)])
+    return ["Against the true particles:", _joined(lines)]
 
 
 def _joined(lines: list[list[str]]) -> str:
@@ -165,7 +182,9 @@ def _nulls(rows: Sequence[Row]) -> list[str]:
         if not row.ok:
             continue
         for name, metric in row.first.metrics.items():
-            if metric.value is None and name in METRICS and METRICS[name].group != "cost":
+            # That no real scene has a truth needs no saying.
+            told = name in METRICS and METRICS[name].group != "cost"
+            if metric.value is None and told and not (name in TRUTH_METRICS and row.first.digests.truth is None):
                 reasons[name, _one_line(metric.reason or "")].append(row.first.method)
     lines = [f"{name}: {reason} ({', '.join(sorted(set(methods)))})" for (name, reason), methods in reasons.items()]
     return ["## Why a figure is missing", _bullets(sorted(lines))] if lines else []

@@ -31,7 +31,7 @@ def check_scene(directory: Path) -> list[str]:
     for camera, count in empty.items():
         if count == scene.n_frames:
             faults.append(f"{scene.directory / 'seg' / camera}: every mask is empty; the camera shows no liquid")
-    for optional in (scene.initial_points, scene.truth_particles):
+    for optional in (scene.initial_points, scene.container_mesh, scene.truth_particles):
         try:
             optional()
         except SplashbenchError as error:

@@ -102,6 +102,7 @@ class SceneMeta(BaseModel):
     times: seconds of each timestep on the reference camera's clock. camera_times: each camera's own exposure times.
     sizes: image (width, height) per camera. metres_per_unit: metric scale. gravity: unit vector along which things
     fall, scene coordinates. container_mesh: path within the scene; container_pose: mesh-to-scene 4x4.
+    container_transparent: whether the liquid is seen through the container.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -114,6 +115,7 @@ class SceneMeta(BaseModel):
     gravity: tuple[float, float, float] | None = None
     container_mesh: str | None = None
     container_pose: list[list[float]] | None = None
+    container_transparent: bool | None = None
     provenance: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")

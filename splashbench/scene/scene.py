@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.files import image_size, read_gray, read_image, read_model, read_npz, sha256_file
 from splashbench.scene.camera import Camera
+from splashbench.scene.container import ContainerMesh, mesh_path, read_mesh
 from splashbench.scene.layout import SceneMeta, SplitFile
 from splashbench.scene.particles import Particles
 
@@ -35,6 +36,7 @@ class Scene:
         times: [T] seconds; times_source says whether they come from "scene.json", the "manifest" or are "nominal".
         camera_times: camera name -> [T] seconds, each camera's own where known, else `times`.
         gravity: unit vector [3] along which things fall, or None. metres_per_unit: metric scale, or None.
+        container_transparent: whether the liquid is seen through the container's walls, or None where unknown.
         is_released: whether this is one of the 20 released scenes, in the release's units.
     """
 
@@ -67,6 +69,7 @@ class Scene:
         self._set_times()
         self.gravity = np.array(meta.gravity) if meta and meta.gravity else None
         self.metres_per_unit = meta.metres_per_unit if meta else None
+        self.container_transparent = meta.container_transparent if meta else None
 
     @classmethod
     def open(cls, directory: Path) -> Scene:
@@ -143,6 +146,17 @@ class Scene:
         path = self.directory / "container_mask" / f"{camera}.png"
         return self._sized(camera, path, read_gray(path)) > 127 if path.is_file() else None
 
+    def container_mesh(self) -> ContainerMesh | None:
+        """The container as a mesh in scene units, or None where the scene has none.
+
+        Raises SplashbenchError when the file is missing, no mesh, or outside the scene's folder.
+        """
+        if self.meta is None or self.meta.container_mesh is None:
+            return None
+        mesh = read_mesh(mesh_path(self.directory, self.meta.container_mesh))
+        pose = self.meta.container_pose
+        return mesh if pose is None else mesh.placed(pose)
+
     def _sized(self, camera: str, path: Path, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
         view = self.cameras[camera]
         if array.shape[:2] != (view.height, view.width):
@@ -163,9 +177,14 @@ class Scene:
         segment = data[:, 6:7] if data.shape[1] > 6 else np.zeros((len(data), 1))
         return np.concatenate([data[:, :6], segment], axis=1).astype(np.float32)
 
+    @property
+    def truth_path(self) -> Path:
+        """Where the true particles of a made-up scene lie, if there are any."""
+        return self.directory / "truth" / "particles.npz"
+
     def truth_particles(self) -> Particles | None:
         """The true particles of a made-up scene, on the scene's timesteps, or None."""
-        path = self.directory / "truth" / "particles.npz"
+        path = self.truth_path
         if not path.is_file():
             return None
         particles = Particles.load(path)
@@ -220,6 +239,7 @@ class TrainingScene:
             scene.metres_per_unit,
             scene.is_released,
         )
+        self.container_transparent = scene.container_transparent
 
     def _training_only(self, camera: str) -> None:
         if camera not in self.cameras:
@@ -239,6 +259,10 @@ class TrainingScene:
         """Container mask [H, W] of a training camera, or None."""
         self._training_only(camera)
         return self._scene.container_mask(camera)
+
+    def container_mesh(self) -> ContainerMesh | None:
+        """The container as a mesh in scene units, or None; see `Scene.container_mesh`."""
+        return self._scene.container_mesh()
 
     def initial_points(self) -> NDArray[np.float32] | None:
         """Static points [N, 7], see `Scene.initial_points`."""

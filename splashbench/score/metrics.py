@@ -22,7 +22,8 @@ class Metric:
         better: direction of better, or None where neither is.
         decimals: printed in CSV and tables; results keep full precision.
         source: where the definition comes from.
-        group: "image", "particles" (both computed here) or "cost" (measured by the harness).
+        group: "image", "particles", "truth" (against true particles; all computed here) or "cost" (measured by the
+            harness).
         version: of the implementation; raised when a change alters values.
     """
 
@@ -32,7 +33,7 @@ class Metric:
     better: Better | None
     decimals: int
     source: str
-    group: Literal["image", "particles", "cost"]
+    group: Literal["image", "particles", "truth", "cost"]
     version: int = 1
 
     @property
@@ -70,8 +71,20 @@ METRICS: dict[str, Metric] = {
         Metric("dynamic_bytes", "Dynamic storage", "B", "lower", 0, _HERE, "cost"),
         Metric("primitives_per_frame", "Primitives per frame", "", None, 0, _HERE, "cost"),
         Metric("carriers_per_frame", "Carriers per frame", "", None, 0, _HERE, "cost"),
+        Metric("surface_chamfer", "Chamfer", "voxels", "lower", 3, _HERE, "truth"),
+        Metric("sdf_iou", "Volume IoU", "", "higher", 4, _HERE, "truth"),
+        Metric("sdf_recall", "Volume recall", "", "higher", 4, _HERE, "truth"),
+        Metric("sdf_precision", "Volume precision", "", "higher", 4, _HERE, "truth"),
+        Metric("velocity_epe", "Velocity EPE", "voxels", "lower", 3, _HERE, "truth"),
+        Metric("velocity_epe_relative", "Relative EPE", "", "lower", 3, _HERE, "truth"),
+        Metric("airborne_epe_relative", "Airborne EPE", "", "lower", 3, _HERE, "truth"),
+        Metric("velocity_coverage", "EPE coverage", "", "higher", 3, _HERE, "truth"),
     )
 }
+
+
+#: The figures against true particles, which made-up scenes alone have.
+TRUTH_METRICS = tuple(name for name, metric in METRICS.items() if metric.group == "truth")
 
 
 def format_value(name: str, value: float | None, missing: str = "") -> str:

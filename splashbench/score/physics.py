@@ -20,21 +20,30 @@ from splashbench.score.views import Track
 PARTICLE_METRICS = ("sigma_d", "mu_d", "uniformity", "delta_e")
 
 
+def liquid_particles(scene: Scene, submission: Any) -> tuple[Particles | None, str]:
+    """The submission's particles that are liquid, on the scene's frames; or None, and why there are none."""
+    particles = submission.particles()
+    if particles is None:
+        return None, "the submission has no particles"
+    if particles.n_frames != scene.n_frames:
+        return None, f"the particles have {particles.n_frames} instants, the scene {scene.n_frames} frames"
+    return (liquid_of_mixed(particles, scene) if submission.identity.mixed else particles), ""
+
+
 def score_particles(
     scene: Scene,
-    submission: Any,
+    particles: Particles | None,
+    no_particles: str,
     fields: Callable[[], DistanceFields],
     protocol: Protocol,
     track: Track,
 ) -> dict[str, MetricValue]:
-    """Every particle metric of a submission; `fields` is asked only when there are particles."""
-    particles = submission.particles()
+    """Every particle metric of `particles`, or of None for the reason `no_particles`.
+
+    `fields` is asked only when there are particles.
+    """
     if particles is None:
-        return _all_null("the submission has no particles")
-    if particles.n_frames != scene.n_frames:
-        return _all_null(f"the particles have {particles.n_frames} instants, the scene {scene.n_frames} frames")
-    if submission.identity.mixed:
-        particles = liquid_of_mixed(particles, scene)
+        return {name: metric_value(name, None, no_particles) for name in PARTICLE_METRICS}
     try:
         distance: DistanceFields | None = fields()
         no_distance = ""
@@ -43,10 +52,6 @@ def score_particles(
     values = _density_values(scene, particles, distance, no_distance, protocol, track)
     values["delta_e"] = _energy_value(scene, particles, protocol)
     return values
-
-
-def _all_null(reason: str) -> dict[str, MetricValue]:
-    return {name: metric_value(name, None, reason) for name in PARTICLE_METRICS}
 
 
 def _density_values(

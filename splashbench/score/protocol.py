@@ -1,6 +1,7 @@
 """Scoring: Submission -> Result by one fixed protocol (paper, "Metrics"; every choice: docs/protocol.md).
 
-The scene is the only ground truth, test views the only images looked at, training masks the only geometry.
+The scene is the only ground truth, test views the only images looked at, training masks the only geometry; true
+particles, where a made-up scene has them, give metrics of their own.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from typing import Any
 
 from splashbench import progress
 from splashbench.errors import SplashbenchError
+from splashbench.files import sha256_file
 from splashbench.scene import Scene
+from splashbench.score.ground_truth import score_ground_truth
 from splashbench.score.lpips import load_lpips
 from splashbench.score.metrics import METRICS
-from splashbench.score.physics import score_particles
+from splashbench.score.physics import liquid_particles, score_particles
 from splashbench.score.result import Digests, MetricValue, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1, Protocol
 from splashbench.score.uniformity import DistanceFields
@@ -63,7 +66,10 @@ def score_submission(
         lpips, no_lpips = load_lpips(lpips_weights)
         weights_digest = lpips.digest if lpips else None
         metrics |= score_views(scene, submission, reference, lpips, no_lpips, protocol, track)
-        metrics |= score_particles(scene, submission, fields or shared_fields(scene, protocol), protocol, track)
+        fields = fields or shared_fields(scene, protocol)
+        particles, no_particles = liquid_particles(scene, submission)
+        metrics |= score_particles(scene, particles, no_particles, fields, protocol, track)
+        metrics |= score_ground_truth(scene, submission, particles, no_particles, fields, protocol, track)
     else:
         no_score = f"the run ended with status {status}"
         metrics |= {name: metric_value(name, None, no_score) for name, m in METRICS.items() if m.group != "cost"}
@@ -85,6 +91,7 @@ def score_submission(
             protocol=protocol.digest,
             reference=reference.digest if reference is not None else None,
             lpips_weights=weights_digest,
+            truth=sha256_file(scene.truth_path) if scene.truth_path.is_file() else None,
         ),
         metrics={name: metrics[name] for name in METRICS},
         claimed={name: value for name, value in identity.claimed.items() if math.isfinite(value)},

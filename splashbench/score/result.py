@@ -34,8 +34,8 @@ class ViewValues(_Frozen):
 class MetricValue(_Frozen):
     """One metric of a result; unit and direction stand beside the value.
 
-    views: per test view, for image metrics. frames: per frame, for particle metrics. skipped_frames: how many
-    (frame, view) pairs or frames had no value.
+    views: per test view, for image metrics. frames: per frame, for all others. skipped_frames: how many (frame, view)
+    pairs or frames had no value.
     """
 
     value: float | None = Field(default=None, allow_inf_nan=False)
@@ -49,13 +49,14 @@ class MetricValue(_Frozen):
 
 
 class Digests(_Frozen):
-    """SHA-256 of everything a result depends on; null is not used."""
+    """SHA-256 of everything a result depends on; null is not used. truth: of the scene's true particles."""
 
     scene: str
     submission: str
     protocol: str
     reference: str | None = None
     lpips_weights: str | None = None
+    truth: str | None = None
 
 
 class Result(_Frozen):

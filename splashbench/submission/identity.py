@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -59,6 +59,10 @@ class Record(BaseModel):
     status: Status = Status.OK
     reason: str = ""
     fit_seconds: float | None = Field(default=None, ge=0, le=_MOST)
+    #: parts that were loaded from an earlier run, and the seconds of their fit there, which fit_seconds includes
+    reused: dict[str, Annotated[float, Field(ge=0, le=_MOST)]] = Field(default_factory=dict)
+    #: seconds of the fit's stages, where the method tells them
+    stages: dict[str, Annotated[float, Field(ge=0, le=_MOST)]] = Field(default_factory=dict)
     render_fps: float | None = Field(default=None, ge=0, le=_MOST)
     timed_frames: int | None = Field(default=None, ge=0)
     peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MOST)

@@ -5,6 +5,7 @@ record.json                 status and costs, by the harness
 renders/<cam>/<frame>.png   sRGB, test views       (status ok only)
 alpha/<cam>/<frame>.png     foreground opacity     (status ok only)
 particles.npz               positions [T, N, 3], active [T, N]; optional
+geometry.npz                the liquid's signed distance [T, nx, ny, nz]; optional
 SHA256SUMS                  of every other file
 """
 
@@ -29,7 +30,7 @@ from splashbench.files import (
     write_png,
     write_text,
 )
-from splashbench.scene import Particles, Scene
+from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission.identity import Identity, Record, Status
 
 IDENTITY = "submission.toml"
@@ -121,6 +122,11 @@ class Submission:
         path = self.directory / "particles.npz"
         return Particles.load(path) if path.is_file() else None
 
+    def geometry(self) -> SignedDistance | None:
+        """The liquid's signed distance, or None."""
+        path = self.directory / "geometry.npz"
+        return SignedDistance.load(path) if path.is_file() else None
+
 
 def integrity_faults(directory: Path) -> list[str]:
     """What speaks against the bytes: a line for every file changed, missing, added, or not a plain file."""
@@ -162,17 +168,22 @@ def check_submission(directory: Path, scene: Scene | None = None) -> list[str]:
     except SplashbenchError as error:
         return [str(error)]
     faults = integrity_faults(directory)
-    try:
-        particles = submission.particles()
-    except SplashbenchError as error:
-        faults.append(str(error))
-        particles = None
+    instants: dict[str, int] = {}
+    for name, read in (("particles.npz", submission.particles), ("geometry.npz", submission.geometry)):
+        try:
+            held = read()
+        except SplashbenchError as error:
+            faults.append(str(error))
+            continue
+        if held is not None:
+            instants[name] = held.n_frames
     if scene is None or submission.status != Status.OK:
         return faults
     if submission.identity.scene_digest != scene.digest:
         faults.append(f"{directory} was made for another version of scene {submission.identity.scene}")
-    if particles is not None and particles.n_frames != scene.n_frames:
-        faults.append(f"{directory / 'particles.npz'} has {particles.n_frames} instants, the scene {scene.n_frames}")
+    for name, n_frames in instants.items():
+        if n_frames != scene.n_frames:
+            faults.append(f"{directory / name} has {n_frames} instants, the scene {scene.n_frames}")
     for name in scene.test:
         camera = scene.cameras[name]
         for t in range(scene.n_frames):

@@ -23,6 +23,8 @@ _RADII = np.array([0.10, 0.08, 0.06])
 _STARTS = np.array([[-0.20, 0.30, 0.0], [0.10, 0.45, 0.05], [0.0, 0.20, -0.10]])
 _VELOCITIES = np.array([[0.8, 1.2, 0.0], [-0.5, 0.6, -0.3], [0.2, 1.8, 0.4]])
 _COLOURS = np.array([[0.10, 0.30, 0.85], [0.15, 0.45, 0.80], [0.05, 0.20, 0.70]])
+#: Half the mean spacing of the largest ball's particles.
+_PARTICLE_RADIUS = 0.0138
 _LIGHT = np.array([0.4, 0.8, 0.45]) / np.linalg.norm([0.4, 0.8, 0.45])
 
 
@@ -44,7 +46,7 @@ def write_balls_scene(
         times=times.tolist(),
         metres_per_unit=1.0,
         gravity=(0.0, -1.0, 0.0),
-        provenance={"made_by": "splashbench.synth.balls", "seed": seed},
+        provenance={"made_by": "splashbench.synth.balls", "seed": seed, "particle_radius": _PARTICLE_RADIUS},
     )
     with atomic_directory(Path(directory), replace=replace, holds="train_meta.json") as staging:
         write_scene(

@@ -1,6 +1,6 @@
-"""Where everything in a made-up capture stands: the bowl, the arc of cameras and the rectangles of the room.
+"""Where everything in a made-up capture stands: the bowl or tank, the arc of cameras and the rectangles of the room.
 
-World coordinates are metres with y up; the bowl stands on the table (y = 0) at the origin. The arc follows the
+World coordinates are metres with y up; the container stands on the table (y = 0) at the origin. The arc follows the
 paper's rig (Sec. 4, "Capture and calibration"): seven cameras over 77 degrees, and the test views lie between
 training views.
 """
@@ -26,6 +26,9 @@ BOWL_RIM_HEIGHT = 0.088
 _BOWL_WALL = 0.009
 _BOWL_FOOT_RADIUS = 0.05
 _BOWL_FOOT_HEIGHT = 0.008
+
+TANK_SIZE = np.array([0.22, 0.14, 0.16])  # of the outside: width, height, depth
+TANK_WALL = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,28 @@ def bowl_mesh(segments: int = 72, rings: int = 20) -> Mesh:
     outer = np.stack([outer_radius, _BOWL_FOOT_HEIGHT + (BOWL_RIM_HEIGHT - _BOWL_FOOT_HEIGHT) * back**1.7], axis=1)
     foot = np.array([[_BOWL_FOOT_RADIUS, 0.0], [_BOWL_FOOT_RADIUS / 2, 0.0], [0.0, 0.0]])
     return revolve(np.concatenate([inner, lip, outer, foot]), segments)
+
+
+def tank_mesh() -> Mesh:
+    """A rectangular tank, open above, its walls and floor of one thickness: a closed mesh, its floor on y = 0."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2  # x, z: anticlockwise seen from below
+
+    def ring(size: Array, y: float) -> Array:
+        x, z = (corners * size).T
+        return np.column_stack([x, np.full(4, y), z])
+
+    outside, height = TANK_SIZE[[0, 2]], float(TANK_SIZE[1])
+    inside = outside - 2 * TANK_WALL
+    rings = [ring(outside, 0.0), ring(outside, height), ring(inside, height), ring(inside, TANK_WALL)]
+    vertices = np.concatenate(rings)
+    faces = [[0, 1, 2], [0, 2, 3], [12, 14, 13], [12, 15, 14]]
+    # From the floor's edge up the outside, over the rim and down the inside.
+    for low in (0, 4, 8):
+        for k in range(4):
+            a, b = low + k, low + (k + 1) % 4
+            faces += [[a, a + 4, b + 4], [a, b + 4, b]]
+    triangles = np.array(faces)
+    return Mesh(vertices.astype(np.float32), triangles.astype(np.int32), _vertex_normals(vertices, triangles))
 
 
 def revolve(profile: Array, segments: int) -> Mesh:

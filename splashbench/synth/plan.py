@@ -45,6 +45,7 @@ SWEEP_FRAMES, SWEEP_FPS = 66, 12
 
 _FIELD_OF_VIEW_DEGREES = 38.0
 _SWEEP_FIELD_OF_VIEW_DEGREES = 52.0
+_WIDEST_CUT = 1.5  # width by height of the landscape image that narrower ones are cut out of
 _CLOCK_SD = 20e-6
 # The drifts of the two worst recorders in the paper, in seconds per second.
 _BAD_CLOCKS = {"4": -49e-6, "7": -81e-6}
@@ -140,7 +141,8 @@ def make_plan(options: Options) -> Plan:
 def _lens(rng: np.random.Generator, size: tuple[int, int], degrees: float) -> tuple[Array, Array]:
     """K [3, 3] and a mild barrel distortion [5], as narrow-view action cameras have it."""
     width, height = size
-    fx = width / 2 / np.tan(np.radians(degrees + rng.uniform(-1, 1)) / 2)
+    # An upright image is a cut-out of a landscape one of its height: it shows no more above and below.
+    fx = max(width, _WIDEST_CUT * height) / 2 / np.tan(np.radians(degrees + rng.uniform(-1, 1)) / 2)
     fy = fx * (1 + rng.uniform(-1e-3, 1e-3))
     cx, cy = np.array([width, height]) * (0.5 + rng.uniform(-0.01, 0.01, 2))
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -3,6 +3,7 @@
 The room does not move, so it is cast once per camera (`View`), with every sample's depth and its colour both in light
 and in the liquid's shadow kept. A frame with liquid (`View.with_liquid`) then costs only the rays that can meet the
 liquid, and the table's and bowl's samples that can lie in its shadow. Image and masks come from the same samples.
+A container of glass (`splashbench.synth.glass`) hides nothing: it is laid over what lies behind it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from splashbench.synth import shading
 from splashbench.synth.geometry import Mesh
+from splashbench.synth.glass import Glass
 from splashbench.synth.lens import LensCamera
 from splashbench.synth.raycast import FAR, Hits, Tracer
 from splashbench.synth.room import Room
@@ -23,9 +25,11 @@ Vectors = NDArray[np.float32]
 
 SAMPLES = 3  # per pixel and axis
 _OFFSET = np.float32(4e-4)  # metres from a surface at which its shadow rays start
+_BEYOND = np.float32(5e-5)  # metres behind one crossing of the liquid's surface at which the next is looked for
 _OPENNESS_RAYS = 16
 _RIM = 32  # pixels beyond the image from which a surface can still reach into it
 _LONGEST_EDGE = 0.006  # metres
+_CROSSINGS = 6  # of the liquid's surface that are followed along a ray through clear liquid
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,7 @@ class Stage:
             meshes.append((room.bowl.vertices, room.bowl.faces))
         self.bowl_index = len(room.quads) if room.bowl is not None else -2
         self.tracer = Tracer(meshes)
+        self.glass = Glass(room.glass) if room.glass is not None else None
 
     def surface(self, points: Vectors, hits: Hits) -> tuple[Vectors, Vectors]:
         """Albedo and shading normal [R, 3] at hit points."""
@@ -101,13 +106,17 @@ class View:
         lit = hit & ~stage.tracer.occluded(lifted, np.broadcast_to(shading.TO_LIGHT, points.shape))
         color = shade + np.where(lit[:, None], light, 0)
         on_bowl = hits.geometry == stage.bowl_index
+        self._panes = stage.glass.along(self._eye, directions) if stage.glass is not None else None
+        on_container = on_bowl if self._panes is None else self._panes.met
         self._distance = hits.distance.reshape(-1, s * s)
         self._lifted, self._color, self._shade = (a.reshape(-1, s * s, 3) for a in (lifted, color, shade))
         self._lit, self._on_bowl = lit.reshape(-1, s * s), on_bowl.reshape(-1, s * s).any(axis=1)
-        self.image = to_srgb(_sample_means(self._color)).reshape(height, width, 3)
+        if self._panes is not None:
+            color = self._panes.through(color, 0.0, FAR)
+        self.image = to_srgb(_sample_means(color.reshape(-1, s * s, 3))).reshape(height, width, 3)
         """The room without liquid: float32 [H, W, 3] sRGB in [0, 1]."""
-        self.container_mask = on_bowl.reshape(height, width, s * s).mean(axis=2) >= 0.5
-        """Where the bowl is seen: bool [H, W]."""
+        self.container_mask = on_container.reshape(height, width, s * s).mean(axis=2) >= 0.5
+        """Where the container is seen: bool [H, W]."""
 
     def seen_points(self) -> tuple[Vectors, Vectors]:
         """What the pixels that meet the room see: points [N, 3] in the world and their sRGB colours [N, 3]."""
@@ -124,7 +133,8 @@ class View:
         near = self._pixels_near(liquid.vertices)
         on_table = liquid.vertices - shading.TO_LIGHT * (liquid.vertices[:, 1:2] / shading.TO_LIGHT[1])
         pixels = np.flatnonzero(near | self._pixels_near(on_table) | self._on_bowl)
-        color, wet = self._color[pixels], np.zeros((len(pixels), self._color.shape[1]), bool)
+        color = self._color[pixels]
+        distance = np.full(color.shape[:2], FAR, np.float32)
         lit = self._lit[pixels]
         darkened = np.zeros_like(lit)
         darkened[lit] = tracer.occluded(
@@ -132,16 +142,22 @@ class View:
         )
         color[darkened] = self._shade[pixels][darkened]
         seen = np.flatnonzero(near[pixels])
-        wet[seen], color[seen] = self._wetted(liquid, tracer, pixels[seen], color[seen])
+        distance[seen], color[seen] = self._wetted(liquid, tracer, pixels[seen], color[seen])
+        if self._panes is not None:
+            before = self._panes.of(self._samples_of(pixels)).through(color.reshape(-1, 3), 0.0, distance.ravel())
+            color = before.reshape(color.shape)
         image = self.image.copy()
         image.reshape(-1, 3)[pixels] = to_srgb(_sample_means(color))
-        mask.ravel()[pixels] = wet.mean(axis=1) >= 0.5
+        mask.ravel()[pixels] = (distance < FAR).mean(axis=1) >= 0.5
         return LiquidFrame(image, mask)
 
     def _wetted(
         self, liquid: Mesh, tracer: Tracer, pixels: NDArray[np.int_], color: Vectors
-    ) -> tuple[NDArray[np.bool_], Vectors]:
-        """Which samples of `pixels` see the liquid first, and `color` with its colour in their place."""
+    ) -> tuple[NDArray[np.float32], Vectors]:
+        """How far the liquid is where samples of `pixels` see it before the room (FAR elsewhere), and its colour there.
+
+        Glass before the liquid is left out; where no liquid is seen, `color` stays.
+        """
         directions = self._directions[pixels]
         hits = tracer.nearest(self._eye, directions.reshape(-1, 3))
         first = hits.distance < self._distance[pixels].ravel()
@@ -154,8 +170,23 @@ class View:
         towards = np.broadcast_to(shading.TO_LIGHT, points.shape)
         lit = ~(tracer.occluded(lifted, towards) | self.stage.tracer.occluded(lifted, towards))
         wet = first.reshape(color.shape[:2])
-        color[wet] = shading.wet(normal, view, lit, shading.bowl_openness(points))
-        return wet, color
+        in_bowl = self.stage.room.bowl is not None
+        openness = shading.bowl_openness(points) if in_bowl else np.ones(len(points), np.float32)
+        behind = None
+        if self.stage.room.clear_liquid:
+            light = color[wet]
+            if self._panes is not None:
+                panes = self._panes.of(self._samples_of(pixels)[first])
+                light = panes.through(light, hits.distance[first], FAR)
+            reach = self._distance[pixels].ravel()[first] - hits.distance[first]
+            behind = shading.Behind(light, thickness(tracer, points, view, reach))
+        color[wet] = shading.wet(normal, view, lit, openness, behind)
+        return np.where(first, hits.distance, FAR).reshape(wet.shape), color
+
+    def _samples_of(self, pixels: NDArray[np.int_]) -> NDArray[np.int_]:
+        """Indices into all samples, in the order of `pixels`."""
+        per_pixel = self._distance.shape[1]
+        return (pixels[:, None] * per_pixel + np.arange(per_pixel)).ravel()
 
     def _pixels_near(self, points: Vectors) -> NDArray[np.bool_]:
         """Which pixels [P] lie within a triangle's reach of any of these surface points."""
@@ -180,6 +211,21 @@ def _sample_means(values: Vectors) -> Vectors:
     for k in range(1, values.shape[1]):
         total += values[:, k]
     return np.asarray(total / values.shape[1], np.float32)
+
+
+def thickness(tracer: Tracer, points: Vectors, directions: Vectors, reach: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Metres of liquid [R] along rays that enter it at `points` [R, 3] and end `reach` [R] metres later."""
+    total, travelled = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    rays, inside = np.arange(len(points)), True
+    for _ in range(_CROSSINGS):
+        start = travelled[rays] + _BEYOND
+        hits = tracer.nearest(points[rays] + start[:, None] * directions[rays], directions[rays])
+        on = hits.geometry >= 0
+        rays, crossing = rays[on], (start + hits.distance)[on]
+        if inside:
+            total[rays] += np.maximum(np.minimum(crossing, reach[rays]) - travelled[rays], 0)
+        travelled[rays], inside = crossing, not inside
+    return total
 
 
 def openness(tracer: Tracer, points: Vectors) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""The room of a made-up capture: textured table and walls, the bowl; for the static scene clutter and the board."""
+"""The room of a made-up capture: textured table and walls, bowl or tank; for the static scene clutter and the board."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.synth.geometry import Mesh, Quad, bowl_mesh, box_quads
+from splashbench.synth.geometry import Mesh, Quad, bowl_mesh, box_quads, tank_mesh
 from splashbench.synth.texture import Albedo, board_albedo, mottled, printed
 
 Array = NDArray[np.float64]
@@ -27,11 +27,16 @@ BOWL_COLOR = (0.66, 0.42, 0.24)
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """What does not move: rectangles, and the bowl with its albedo per vertex [V, 3] (None where cleared away)."""
+    """What does not move: rectangles, and the bowl with its albedo per vertex [V, 3] (None where cleared away).
+
+    `glass` is a clear container in the bowl's place; `clear_liquid` says that the liquid lets light through.
+    """
 
     quads: list[Quad]
     bowl: Mesh | None
     bowl_albedo: Albedo | None
+    glass: Mesh | None = None
+    clear_liquid: bool = False
 
 
 @lru_cache(maxsize=1)
@@ -61,6 +66,11 @@ def pour_room(seed: int) -> Room:
     speckle = 1 + 0.03 * rng.standard_normal((len(bowl.vertices), 1))
     albedo = np.array(BOWL_COLOR) * shade * speckle
     return Room(list(bare_quads(seed)), bowl, albedo.astype(np.float32))
+
+
+def tank_room(seed: int) -> Room:
+    """The same room with the glass tank on the table, for a liquid that is clear too."""
+    return Room(list(bare_quads(seed)), None, None, glass=tank_mesh(), clear_liquid=True)
 
 
 def static_room(seed: int, board: dict[str, Any]) -> Room:

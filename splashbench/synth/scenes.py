@@ -7,7 +7,7 @@ calibration, synchronisation or masks is wrong. Scene units are metres, y points
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,11 +18,11 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
 from splashbench.synth import simulation
-from splashbench.synth.geometry import bowl_mesh
+from splashbench.synth.geometry import Mesh, bowl_mesh, tank_mesh
 from splashbench.synth.lens import LensCamera
 from splashbench.synth.plan import CAMERAS, GRAVITY, TEST, TRAIN, Options, make_plan
 from splashbench.synth.rendering import Stage, View
-from splashbench.synth.room import pour_room
+from splashbench.synth.room import Room, pour_room, tank_room
 from splashbench.synth.session import write_ply
 from splashbench.synth.simulation import Pour
 from splashbench.synth.surface import liquid_surface
@@ -30,67 +30,136 @@ from splashbench.synth.trajectory import Trajectory
 from splashbench.synth.video import SensorNoise
 
 _POINTS_PER_VIEW = 4000
+_SOURCE_FRAME_MS = 1000 / 60
+_LONGEST_SECONDS = 10.0
+# The simulation runs on for a moment, so that the last frame too lies between two of its snapshots.
+_AFTER_SECONDS = 0.02
+
+
+@dataclass(frozen=True)
+class Container:
+    """What the liquid is poured into: its closed mesh, the room it stands in (given the seed), and if it is clear."""
+
+    mesh: Callable[[], Mesh]
+    room: Callable[[int], Room]
+    transparent: bool
+
+
+BOWL = Container(bowl_mesh, pour_room, transparent=False)
+TANK = Container(tank_mesh, tank_room, transparent=True)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A pour, and the part of it, in seconds from its start, that the scene shows."""
+    """A pour, and the instants of it that the scene shows.
+
+    Attributes:
+        title: what there is to see.
+        pour: what is poured; it is simulated for as long as the frames last.
+        start: seconds from the start of the simulation to the first frame.
+        steps_ms: milliseconds between frames, repeated from the beginning where there are more frames.
+        container: what it is poured into.
+    """
 
     title: str
     pour: Pour
-    shown: tuple[float, float]
+    start: float
+    steps_ms: tuple[float, ...]
+    container: Container = BOWL
 
+    def times(self, timesteps: int, step_ms: float | None = None) -> NDArray[np.float64]:
+        """Instants [timesteps] in seconds of the simulation; `step_ms` replaces the recipe's own steps."""
+        cycle = self.steps_ms if step_ms is None else (step_ms,)
+        steps = np.resize(np.array(cycle) / 1000, timesteps - 1)
+        return self.start + np.concatenate([[0.0], np.cumsum(steps)])
+
+
+DEFAULT_SIZE = (480, 320)
+
+# Out of sight of every camera, whatever the images' shape: none shows more above the bowl than one of 3:2.
+_NOZZLE = (-0.08, 0.36, 0.0)
+# With -78 degrees and 0.85 m/s, what splashes over the bowl's rim is drops: faster or flatter, a slosh goes over.
+_NOZZLE_OVER_BOWL = (-0.065, 0.36, 0.0)
+# So low that nothing splashes; for liquid that is all there before the first frame.
+_NOZZLE_IN_BOWL = (-0.04, 0.17, 0.0)
 
 RECIPES: dict[str, Recipe] = {
-    "opaque_bowl": Recipe("a pour that splashes in an opaque bowl", Pour(duration=1.3), (0.1, 1.28)),
+    "opaque_bowl": Recipe(
+        "a pour that splashes in an opaque bowl",
+        Pour(emit_until=1.45, speed=0.85, nozzle=_NOZZLE_OVER_BOWL, angle_degrees=-78.0),
+        0.1,
+        (33.0,),
+    ),
+    "glass_tank": Recipe(
+        "a pour into a glass tank, seen through its walls at uneven times",
+        Pour(emit_until=2.4, particle_radius=0.0035, stream_diameter=0.028, nozzle=_NOZZLE),
+        0.1,
+        tuple(frames * _SOURCE_FRAME_MS for frames in (4, 3, 5, 4, 5, 3, 4)),
+        TANK,
+    ),
     "thin_stream": Recipe(
         "a stream a centimetre thick, at the limit of what the cameras resolve",
-        Pour(duration=1.3, particle_radius=0.0025, stream_diameter=0.010, speed=0.9),
-        (0.1, 1.28),
+        Pour(emit_until=1.75, particle_radius=0.0025, stream_diameter=0.010, speed=0.9, nozzle=_NOZZLE),
+        0.1,
+        (40.0,),
     ),
-    "still_pool": Recipe("a pool coming to rest", Pour(duration=2.4, emit_until=0.9), (1.6, 2.38)),
+    "still_pool": Recipe(
+        "a pool coming to rest",
+        Pour(emit_until=0.95, particle_radius=0.0035, stream_diameter=0.028, speed=0.8, nozzle=_NOZZLE_IN_BOWL),
+        1.0,
+        (100.0,),
+    ),
 }
 
 
 def make_scene(
     name: str,
     out: Path,
-    size: tuple[int, int] = (480, 270),
+    size: tuple[int, int] = DEFAULT_SIZE,
     timesteps: int = 50,
     seed: int = 0,
     particle_radius: float | None = None,
+    step_ms: float | None = None,
     replace_existing: bool = False,
 ) -> Scene:
     """Make the scene `name` of `RECIPES` in the new folder `out`, with `timesteps` frames of `size` (width, height).
 
-    `particle_radius` in metres replaces the recipe's own.
-    Raises SplashbenchError for an unknown name, or when the liquid solver cannot run.
+    `particle_radius` in metres replaces the recipe's own; `step_ms` milliseconds between all frames, its time steps.
+    Raises SplashbenchError for an unknown name, for frames that last too long, or when the liquid solver cannot run.
     """
     if name not in RECIPES:
         raise SplashbenchError(f"there is no made-up scene {name!r}; choose one of {', '.join(RECIPES)}")
     if timesteps < 2:
         raise SplashbenchError(f"--timesteps {timesteps} will not do; give 2 or more")
+    if step_ms is not None and not 0 < step_ms < np.inf:
+        raise SplashbenchError(f"--step {step_ms:g} will not do; give milliseconds above 0")
     recipe = RECIPES[name]
+    shown = recipe.times(timesteps, step_ms)
+    if shown[-1] - shown[0] > _LONGEST_SECONDS:
+        raise SplashbenchError(
+            f"{timesteps} frames would last {shown[-1] - shown[0]:.1f} s, and no scene lasts more than "
+            f"{_LONGEST_SECONDS:.0f} s; give fewer --timesteps or a smaller --step"
+        )
     radius = recipe.pour.particle_radius if particle_radius is None else particle_radius
     options = Options(size=size, seed=seed, particle_radius=radius)
     plan = make_plan(options)
     pour = replace(
         recipe.pour,
+        duration=float(shown[-1]) + _AFTER_SECONDS,
         azimuth_degrees=plan.pour.azimuth_degrees,
         particle_radius=options.particle_radius,
     )
     lenses = {camera: _pinhole(plan.recorders[camera].camera) for camera in CAMERAS}
-    shown = np.linspace(*recipe.shown, timesteps)
     with (
         atomic_directory(Path(out), replace=replace_existing, holds="train_meta.json") as staging,
         tempfile.TemporaryDirectory(prefix="splashbench-") as scratch,
     ):
-        running = simulation.start(pour, bowl_mesh(), Path(scratch))
+        running = simulation.start(pour, recipe.container.mesh(), Path(scratch))
         try:
             trajectory = running.finish()
         finally:
             running.stop()
-        stage = Stage(pour_room(seed))
+        stage = Stage(recipe.container.room(seed))
         views = {camera: View(stage, lens, samples=1) for camera, lens in lenses.items()}
         write_scene(
             staging,
@@ -106,15 +175,21 @@ def make_scene(
                 gravity=GRAVITY,
                 container_mesh="truth/container.ply",
                 container_pose=np.eye(4).tolist(),
-                provenance={"made_by": "splashbench synth scene", "recipe": recipe.title, "seed": seed},
+                container_transparent=recipe.container.transparent,
+                provenance={
+                    "made_by": "splashbench synth scene",
+                    "recipe": recipe.title,
+                    "seed": seed,
+                    "particle_radius": radius,
+                },
             ),
             initial_points=_initial_points([views[camera] for camera in TRAIN], seed),
             container_masks={camera: view.container_mask for camera, view in views.items()},
         )
         (staging / "truth").mkdir()
         _true_particles(trajectory, shown).save(staging / "truth" / "particles.npz")
-        bowl = bowl_mesh()
-        write_ply(staging / "truth" / "container.ply", bowl.vertices, bowl.faces)
+        container = recipe.container.mesh()
+        write_ply(staging / "truth" / "container.ply", container.vertices, container.faces)
     return Scene.open(out)
 
 

@@ -5,6 +5,8 @@ Everything is linear light on float32 arrays [R, 3]; a surface of albedo 1 in fu
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,8 @@ SKY = np.float32(0.62)
 LIQUID_ALBEDO = np.array([0.035, 0.13, 0.50], np.float32)
 _REFLECTANCE_HEAD_ON = 0.02  # of water in air
 _GLOSS = 90.0
+#: Of the dyed liquid where it is clear, per metre of red, green and blue light.
+LIQUID_ABSORPTION = np.array([70.0, 30.0, 9.0], np.float32)
 
 
 def ambient(normal: Vectors) -> NDArray[np.float32]:
@@ -37,11 +41,25 @@ def matte(albedo: Vectors, normal: Vectors) -> tuple[Vectors, Vectors]:
     return shaded + albedo * key_light(normal), shaded
 
 
-def wet(normal: Vectors, view: Vectors, lit: NDArray[np.bool_], openness: NDArray[np.float32]) -> Vectors:
-    """Dyed, opaque liquid seen along unit `view` directions: diffuse dye, Fresnel mirror of the room, and a highlight.
+@dataclass(frozen=True, eq=False)
+class Behind:
+    """What clear liquid lets through: the light `color` [R, 3] behind it, and the way `thickness` [R], metres."""
 
-    `lit` [R]: reached by the key light; `openness` [R]: share of the sky that is not blocked. Reflectance after
-    Schlick 1994.
+    color: Vectors
+    thickness: NDArray[np.float32]
+
+
+def wet(
+    normal: Vectors,
+    view: Vectors,
+    lit: NDArray[np.bool_],
+    openness: NDArray[np.float32],
+    behind: Behind | None = None,
+) -> Vectors:
+    """Dyed liquid seen along unit `view` directions: diffuse dye, Fresnel mirror of the room, and a highlight.
+
+    `lit` [R]: reached by the key light; `openness` [R]: share of the sky that is not blocked; `behind`: what a clear
+    liquid mixes in (Beer-Lambert, without refraction), None for an opaque one. Reflectance after Schlick 1994.
     """
     towards = np.where(np.einsum("ij,ij->i", normal, view)[:, None] > 0, -normal, normal)
     facing = np.clip(-np.einsum("ij,ij->i", towards, view), 0, 1)
@@ -51,7 +69,11 @@ def wet(normal: Vectors, view: Vectors, lit: NDArray[np.bool_], openness: NDArra
     half = TO_LIGHT - view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     highlight = np.maximum(np.einsum("ij,ij->i", towards, half), 0) ** _GLOSS * 0.9 * lit
-    color = LIQUID_ALBEDO * diffuse + (fresnel * openness)[:, None] * surroundings(mirror)
+    body = LIQUID_ALBEDO * diffuse
+    if behind is not None:
+        clear = np.exp(-LIQUID_ABSORPTION * behind.thickness[:, None])
+        body = clear * (1 - fresnel)[:, None] * behind.color + (1 - clear) * body
+    color = body + (fresnel * openness)[:, None] * surroundings(mirror)
     return (color + highlight[:, None]).astype(np.float32)
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from splashbench_methods.controls.nothing import Nothing
 from splashbench_methods.scaffold_gs import Background, BackgroundSettings, ScaffoldGS, StaticScene, fit_background
 
+from splashbench import parallel
 from splashbench.adapter.contract import Run
 from splashbench.errors import SplashbenchError
+from splashbench.render import cpu
 from splashbench.scene import Scene
 
 SETTINGS = BackgroundSettings(iterations=150, anchors=1500, children=3, longest_side=96)
@@ -45,13 +48,154 @@ def test_where_liquid_passes_the_background_shows_what_lies_behind(balls: Scene,
     assert excess(rendered) < 0.25 * excess(liquid)
 
 
-def test_the_same_seed_gives_the_same_background(balls: Scene):
-    small = BackgroundSettings(iterations=8, anchors=200, children=2, longest_side=64)
+TINY = BackgroundSettings(iterations=8, anchors=200, children=2, longest_side=64)
+GROWING = BackgroundSettings(
+    start="points", iterations=12, anchors=400, children=2, grow_until=1, grow_every=4, grow_gradient=1e-5
+)
+
+
+@pytest.mark.parametrize("settings", [TINY, GROWING], ids=["seeded", "growing"])
+def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
+    balls: Scene, settings: BackgroundSettings, monkeypatch: pytest.MonkeyPatch
+):
+    def image(seed: int, threads: int) -> np.ndarray:
+        monkeypatch.setattr(parallel, "thread_count", lambda: threads)
+        with cpu.threads(threads):
+            return fit_background(balls.training(), settings, Run(seed=seed)).render(balls.cameras[balls.test[0]])
+
+    first = image(3, 1)
+    np.testing.assert_array_equal(first, image(3, 3))
+    assert np.abs(first - image(4, 1)).max() > 1e-3
+
+
+def test_depth_is_that_of_what_is_seen_and_infinite_where_nothing_is(balls: Scene, background: Background):
     camera = balls.cameras[balls.test[0]]
-    first, again = (fit_background(balls.training(), small, Run(seed=3)).render(camera) for _ in range(2))
-    other = fit_background(balls.training(), small, Run(seed=4)).render(camera)
-    np.testing.assert_array_equal(first, again)
-    assert np.abs(first - other).max() > 1e-3
+    depth = background.depth(camera)
+    assert depth.shape == (camera.height, camera.width)
+    assert depth.dtype == np.float32
+    means, _, opacities, _ = background.gaussians(camera)
+    uv, distance = camera.project(means)
+    column, row = np.floor(uv).astype(int).T
+    inside = (distance > 0) & (opacities > 0.3) & (uv >= 0).all(1) & (column < camera.width) & (row < camera.height)
+    ratio = distance[inside] / depth[row[inside], column[inside]]
+    assert abs(np.median(ratio) - 1) < 0.05
+    # Turned around, the camera sees no Gaussian at all.
+    turned = np.diag([-1.0, 1, -1, 1]) @ camera.w2c
+    behind = type(camera)(camera.name, camera.width, camera.height, camera.K, turned)
+    assert np.isposinf(background.depth(behind)).all()
+
+
+def _paint(path: Path, change) -> None:  # type: ignore[no-untyped-def]
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert cv2.imwrite(str(path), change(image))
+
+
+def test_the_first_frame_alone_is_used_where_that_is_asked_for(balls_copy: Path):
+    scene = Scene.open(balls_copy)
+    camera = scene.cameras[scene.test[0]]
+    first = BackgroundSettings(**{**TINY.model_dump(), "frames": "first"})
+
+    def image(settings: BackgroundSettings) -> np.ndarray:
+        return fit_background(scene.training(), settings, Run(seed=0)).render(camera)
+
+    before = image(first), image(TINY)
+    for name in scene.train:
+        for t in range(1, scene.n_frames):
+            _paint(scene.image_path(name, t), lambda old: 255 - old)
+            _paint(scene.mask_path(name, t), np.zeros_like)
+    np.testing.assert_array_equal(image(first), before[0])
+    assert np.abs(image(TINY) - before[1]).max() > 0.1
+
+
+def test_liquid_of_the_first_frame_is_not_baked_in(balls_copy: Path):
+    scene = Scene.open(balls_copy)
+    for name in scene.train:
+        wet = scene.mask(name, 0)
+        assert wet.any()
+        _paint(scene.image_path(name, 0), lambda old, wet=wet: np.where(wet[..., None], (255, 0, 255), old))
+    settings = BackgroundSettings(**{**SETTINGS.model_dump(), "frames": "first", "iterations": 40})
+    background = fit_background(scene.training(), settings, Run(seed=0))
+    rendered = background.render(scene.cameras[scene.train[2]])[scene.mask(scene.train[2], 0)]
+    magenta = rendered[:, [0, 2]].min(axis=1) - rendered[:, 1]
+    assert magenta.mean() < 0.2
+
+
+@pytest.mark.parametrize("settings", [TINY, GROWING], ids=["seeded", "growing"])
+def test_a_single_training_view_is_enough(balls: Scene, settings: BackgroundSettings):
+    scene = balls.training()
+    scene.train = scene.train[:1]
+    background = fit_background(scene, settings, Run(seed=0))
+    assert len(background.model) > 0
+    assert np.isfinite(background.render(balls.cameras[balls.test[0]])).all()
+
+
+def test_a_view_that_is_liquid_throughout_is_left_out_and_all_of_them_are_an_error(balls_copy: Path):
+    scene = Scene.open(balls_copy)
+    full = lambda old: np.full_like(old, 255)  # noqa: E731
+    for t in range(scene.n_frames):
+        _paint(scene.mask_path(scene.train[0], t), full)
+    background = fit_background(scene.training(), SETTINGS, Run(seed=0))
+    name = scene.train[2]
+    dry = ~np.any([scene.mask(name, t) for t in range(scene.n_frames)], axis=0)
+    assert psnr(background.render(scene.cameras[name]), scene.image(name, 0) / 255.0, dry) > 18
+    for name in scene.train[1:]:
+        _paint(scene.mask_path(name, 0), full)
+    with pytest.raises(SplashbenchError, match=r"every training view in frame 0; mend the masks"):
+        fit_background(scene.training(), BackgroundSettings(frames="first"), Run(seed=0))
+    for name in scene.train[1:]:
+        for t in range(scene.n_frames):
+            _paint(scene.mask_path(name, t), full)
+    with pytest.raises(SplashbenchError, match=r"every training view throughout; mend the masks"):
+        fit_background(scene.training(), TINY, Run(seed=0))
+
+
+def test_cameras_may_differ_in_size(balls: Scene):
+    class Sizes:
+        """The balls, with the first training view cropped."""
+
+        def __init__(self) -> None:
+            self.inner = balls.training()
+            self.train, self.n_frames, self.directory = self.inner.train, self.inner.n_frames, self.inner.directory
+            self.initial_points = self.inner.initial_points
+            name = self.train[0]
+            self.cameras = {**self.inner.cameras, name: self.inner.cameras[name].cropped(10, 6, 60, 50)}
+
+        def _window(self, name: str, array: np.ndarray) -> np.ndarray:
+            return array[6:56, 10:70] if name == self.train[0] else array
+
+        def image(self, name: str, t: int) -> np.ndarray:
+            return self._window(name, self.inner.image(name, t))
+
+        def mask(self, name: str, t: int) -> np.ndarray:
+            return self._window(name, self.inner.mask(name, t))
+
+    for settings in (TINY, GROWING):
+        background = fit_background(Sizes(), settings, Run(seed=0))  # type: ignore[arg-type]
+        assert np.isfinite(background.render(balls.cameras[balls.test[0]])).all()
+
+
+def test_starting_from_sparse_points_needs_some(balls_copy: Path):
+    path = balls_copy / "init_pt_cld.npz"
+    np.savez(path, data=np.empty((0, 7), np.float32))
+    with pytest.raises(SplashbenchError, match=r"init_pt_cld\.npz holds no points.*start=pixels"):
+        fit_background(Scene.open(balls_copy).training(), GROWING, Run(seed=0))
+    assert len(fit_background(Scene.open(balls_copy).training(), TINY, Run(seed=0)).model) > 0
+    path.unlink()
+    with pytest.raises(SplashbenchError, match=r"init_pt_cld\.npz holds no points.*start=pixels"):
+        fit_background(Scene.open(balls_copy).training(), GROWING, Run(seed=0))
+
+
+def test_presets_are_the_papers_and_ours():
+    paper, best, quick = (BackgroundSettings.preset(name) for name in ("paper", "best", "quick"))
+    assert isinstance(paper, BackgroundSettings)
+    assert (paper.frames, paper.start, paper.iterations, paper.children) == ("first", "points", 20_000, 10)
+    assert paper.grow_from * paper.iterations == 1500
+    assert paper.grow_until * paper.iterations == 10_000
+    assert (paper.grow_every, paper.grow_gradient, paper.prune_opacity) == (100, 2e-4, 0.005)
+    for ours in (best, quick):
+        assert isinstance(ours, BackgroundSettings)
+        assert (ours.frames, ours.start) == ("all", "pixels")
+    assert next(iter(BackgroundSettings.presets)) == "best"
 
 
 def test_what_was_saved_renders_the_same_bits(balls: Scene, background: Background, tmp_path: Path):

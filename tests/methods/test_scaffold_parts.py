@@ -1,4 +1,4 @@
-"""The pieces of the static background: plates, seeds of anchors, the decoder, the losses."""
+"""The pieces of the static background: plates, seeds of anchors, the decoder, the losses, the pyramid."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors
+from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench_methods.scaffold_gs.depth import depth_maps, look_at
-from splashbench_methods.scaffold_gs.fitting import l1
-from splashbench_methods.scaffold_gs.model import AnchorModel, rotation_matrices
+from splashbench_methods.scaffold_gs.fitting import pyramid
+from splashbench_methods.scaffold_gs.losses import l1
+from splashbench_methods.scaffold_gs.model import AnchorModel, Variant, rotation_matrices
 from splashbench_methods.scaffold_gs.plate import Plate, make_plate, masked_median
 
 from splashbench.scene import Camera
@@ -58,16 +59,27 @@ class TestPlate:
         plate = make_plate(scene, "1", longest_side=1000)
         assert 0 < (~plate.seen).sum() < 200
         assert not plate.seen[30, 40]
-        np.testing.assert_array_equal((plate.image[plate.seen] * 255).round(), background[plate.seen])
+        np.testing.assert_array_equal(plate.image[plate.seen], background[plate.seen])
 
     def test_shrinking_moves_the_camera_along(self, passing_liquid):
         scene, background = passing_liquid
         plate = make_plate(scene, "1", longest_side=40)
         assert (plate.camera.width, plate.camera.height) == (40, 30)
         np.testing.assert_allclose(plate.camera.K[:2], scene.cameras["1"].K[:2] / 2)
-        small = cv2.resize(background, (40, 30), interpolation=cv2.INTER_AREA) / 255
-        np.testing.assert_allclose(plate.image[plate.seen], small[plate.seen], atol=0.02)
+        small = cv2.resize(background, (40, 30), interpolation=cv2.INTER_AREA)
+        np.testing.assert_allclose(plate.image[plate.seen], small[plate.seen], atol=5)
         assert (plate.image[~plate.seen] == 0).all()
+
+    def test_one_frame_is_the_first_and_later_ones_are_not_even_read(self, passing_liquid):
+        scene, background = passing_liquid
+        read: list[int] = []
+        image = scene.image
+        scene.image = lambda name, t: read.append(t) or image(name, t)
+        plate = make_plate(scene, "1", longest_side=1000, n_frames=1)
+        assert read == [0]
+        assert not plate.seen[15, 15]
+        assert plate.seen[15, 30]
+        np.testing.assert_array_equal(plate.image[plate.seen], background[plate.seen])
 
 
 class _FakeScene:
@@ -96,10 +108,7 @@ def passing_liquid():
 
 def floor_plates() -> list[Plate]:
     cameras = [arc_camera(str(i), degrees) for i, degrees in enumerate((-38, -19, 0, 19, 38))]
-    return [
-        Plate(c, floor_color(floor_points(c)).astype(np.float32) / 255, np.ones((c.height, c.width), bool))
-        for c in cameras
-    ]
+    return [Plate(c, floor_color(floor_points(c)), np.ones((c.height, c.width), bool)) for c in cameras]
 
 
 TABLE_HEIGHT = 1.0
@@ -118,8 +127,8 @@ def table_plates() -> list[Plate]:
     plates = []
     for plate in floor_plates():
         points, on_table = table_points(plate.camera)
-        pattern = floor_color(2.5 * points + np.where(on_table, 0.7, 0)[..., None]).astype(np.float32) / 255
-        plates.append(replace(plate, image=pattern * np.where(on_table, 0.7, 1)[..., None].astype(np.float32)))
+        pattern = floor_color(2.5 * points + np.where(on_table, 0.7, 0)[..., None])
+        plates.append(replace(plate, image=(pattern * np.where(on_table, 0.7, 1)[..., None]).astype(np.uint8)))
     return plates
 
 
@@ -186,13 +195,26 @@ class TestAnchors:
         assert np.isfinite(seed.positions).all()
         assert np.median(np.linalg.norm(seed.positions, axis=1)) < 10
 
+    def test_sparse_points_give_one_anchor_per_voxel_at_its_centre(self):
+        pairs = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 0, 0], [0.1, 0, 0]])
+        points = np.concatenate([pairs, [[0.2, 0, 0]] * 4 + [[0.8, 0, 0]]], axis=1).astype(np.float32)
+        seed = sparse_anchors(points, 100)
+        # The nearest neighbours are 0.1, 0.9, 1, 3 and 0.1 away: the voxel is their median.
+        assert seed.voxel == pytest.approx(0.9, rel=1e-5)
+        np.testing.assert_allclose(seed.positions[:, 0], [0, 0.9, 1.8, 5.4], rtol=1e-5)
+        np.testing.assert_allclose(seed.colors[0], [0.5, 0, 0], atol=1e-6)
+        assert len(sparse_anchors(points, 2).positions) <= 2
+        assert len(sparse_anchors(points[:1], 100).positions) == 1
+
 
 class TestModel:
-    def model(self, n: int = 20) -> AnchorModel:
+    def model(self, n: int = 20, variant: Variant = Variant(3)) -> AnchorModel:  # noqa: B008
         torch.manual_seed(0)
         rng = np.random.default_rng(0)
-        seed = AnchorSeed(*(a.astype(np.float32) for a in (rng.normal(size=(n, 3)), rng.random((n, 3)), np.ones(n))))
-        return AnchorModel.from_seed(seed, children=3, view_dependent_shape=False)
+        seed = AnchorSeed(
+            *(a.astype(np.float32) for a in (rng.normal(size=(n, 3)), rng.random((n, 3)), np.ones(n))), voxel=1.0
+        )
+        return AnchorModel.from_seed(seed, variant)
 
     def test_rotations_of_unnormalised_quaternions_are_rotations(self):
         R = rotation_matrices(torch.randn(50, 4, generator=torch.Generator().manual_seed(0)) * 5).double()
@@ -211,30 +233,53 @@ class TestModel:
         assert (opacities > 0.3).all()
         np.testing.assert_allclose(torch.linalg.det(factors).abs().detach(), scales.prod(1).detach(), rtol=1e-3)
 
-    def test_children_of_non_positive_opacity_are_not_drawn(self):
-        model = self.model()
+    def test_without_a_base_colour_the_seeds_colours_play_no_part(self):
+        base, plain = self.model(), self.model(variant=Variant(3, base_color=False))
         with torch.no_grad():
-            model.opacity_head[-1].weight.zero_()
-            model.opacity_head[-1].bias.copy_(torch.tensor([0.5, -0.5, 0.25]))
-        means, _, opacities, _, _ = model.decode(np.zeros(3))
-        assert len(means) == 40
-        np.testing.assert_allclose(opacities[:2].detach(), np.tanh([0.5, 0.25]), rtol=1e-5)
+            for model in (base, plain):
+                model.features[:, :3] += 9
+                model.color_head[-1].weight.zero_()
+        assert (base.decode(np.zeros(3)).colors > 0.9).all()
+        np.testing.assert_allclose(plain.decode(np.zeros(3)).colors.detach(), 0.5, atol=1e-6)
 
     def test_only_colour_depends_on_the_viewpoint_unless_asked(self):
-        model = self.model()
-        one, other = model.decode(np.array([0.0, 0, 9])), model.decode(np.array([9.0, 0, 0]))
+        here, there = np.array([0.0, 0, 9]), np.array([9.0, 0, 0])
+        one, other = self.model().decode(here), self.model().decode(there)
         assert all(torch.equal(one[i], other[i]) for i in (0, 1, 2))
-        assert not torch.equal(one[3], other[3])
-        model.view_dependent_shape = True
-        assert not torch.equal(model.decode(np.array([9.0, 0, 0]))[2], one[2])
+        assert not torch.equal(one.colors, other.colors)
+        model = self.model(variant=Variant(3, view_dependent_shape=True))
+        assert not torch.equal(model.decode(here).opacities, model.decode(there).opacities)
 
 
-def test_unseen_pixels_carry_no_loss():
-    rng = np.random.default_rng(0)
-    image, other = (rng.random((14, 17, 3)).astype(np.float32) for _ in range(2))
-    weight = np.zeros(image.shape[:2], np.float32)
-    weight[5, 5] = 1
-    expected = np.abs(image[5, 5] - other[5, 5]).mean()
-    got = l1(torch.tensor(image), torch.tensor(other), torch.tensor(weight)).item()
-    assert got == pytest.approx(expected, rel=1e-5)
-    assert l1(torch.tensor(image), torch.tensor(other), torch.zeros(14, 17)).item() == 0
+class TestLoss:
+    def plate(self, seen: np.ndarray) -> Plate:
+        rng = np.random.default_rng(0)
+        camera = arc_camera("1", 0, seen.shape[1], seen.shape[0])
+        return Plate(camera, rng.integers(0, 256, (*seen.shape, 3)).astype(np.uint8), seen)
+
+    def test_unseen_pixels_carry_no_loss_and_no_gradient(self):
+        seen = np.zeros((14, 17), bool)
+        seen[5, 5] = True
+        plate = self.plate(seen)
+        image = torch.rand(14, 17, 3, generator=torch.Generator().manual_seed(0), requires_grad=True)
+        loss = l1(image, plate)
+        loss.backward()
+        assert loss.item() == pytest.approx((image[5, 5] - torch.tensor(plate.floats()[5, 5])).abs().mean().item())
+        assert torch.count_nonzero(image.grad) == torch.count_nonzero(image.grad[5, 5]) == 3
+        assert l1(image, self.plate(np.zeros((14, 17), bool))).item() == 0
+
+    def test_value_and_gradient_are_those_of_torch(self):
+        plate = self.plate(np.random.default_rng(1).random((70, 31)) < 0.5)
+        image = torch.rand(70, 31, 3, generator=torch.Generator().manual_seed(0), requires_grad=True)
+        target, seen = torch.tensor(plate.floats()), torch.tensor(plate.seen)
+        expected = (image - target).abs()[seen].mean()
+        (gradient,) = torch.autograd.grad(2 * expected, image)
+        loss = l1(image, plate)
+        (2 * loss).backward()
+        assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+        np.testing.assert_allclose(image.grad, gradient, rtol=1e-5)
+
+
+def test_images_grow_until_whole_and_half_of_the_steps_left_go_to_each_smaller_size():
+    assert pyramid(1800, 400, 1000) == {0: 225, 500: 450, 750: 900, 875: 1800}
+    assert pyramid(400, 400, 1000) == {0: 400}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splashbench.scene import Particles, Scene
+from splashbench.scene import Particles, Scene, SignedDistance
 
 _COSTS = ("fit_seconds", "render_fps", "peak_memory_bytes", "peak_device_memory_bytes", "storage_bytes")
 _COSTS += ("dynamic_bytes", "primitives_per_frame", "carriers_per_frame")
@@ -28,6 +28,7 @@ class FakeSubmission:
     status: str = "ok"
     reason: str = ""
     particle_set: Particles | None = None
+    signed_distance: SignedDistance | None = None
     change: Callable[[np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]] | None = None
     scene_digest: str | None = None
 
@@ -69,6 +70,9 @@ class FakeSubmission:
 
     def particles(self) -> Particles | None:
         return self.particle_set
+
+    def geometry(self) -> SignedDistance | None:
+        return self.signed_distance
 
 
 @pytest.fixture

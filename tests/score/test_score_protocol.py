@@ -19,6 +19,8 @@ NAMES = [
     *("sigma_d", "mu_d", "uniformity", "delta_e", "miou", "fit_seconds", "render_fps"),
     *("peak_memory_bytes", "peak_device_memory_bytes", "storage_bytes", "dynamic_bytes"),
     *("primitives_per_frame", "carriers_per_frame"),
+    *("surface_chamfer", "sdf_iou", "sdf_recall", "sdf_precision"),
+    *("velocity_epe", "velocity_epe_relative", "airborne_epe_relative", "velocity_coverage"),
 ]
 
 
@@ -204,6 +206,11 @@ def test_particles_with_other_instants_are_not_scored(balls: Scene, fake: Any, q
     short = Particles(truth.positions[:-1], truth.active[:-1])
     result = score_submission(balls, fake(balls, particle_set=short), track=quiet)
     assert "instants" in str(result.metrics["uniformity"].reason)
+
+
+def test_protocol_v1_is_what_earlier_results_were_scored_by() -> None:
+    """Results of another digest would no longer count as the same protocol, and a submission scored twice as two."""
+    assert PROTOCOL_V1.digest == "a4545659af50851b5fe66b3969e2fe73dc8ef67f082a847e5e6047b6415c785f"
 
 
 def test_a_changed_setting_is_no_longer_protocol_v1(balls: Scene, fake: Any, quiet: Any) -> None:

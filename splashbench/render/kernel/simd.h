@@ -28,10 +28,16 @@ inline Ints load(const int32_t* at) { return *reinterpret_cast<const Ints*>(at);
 inline void store(float* at, Floats value) { *reinterpret_cast<Floats*>(at) = value; }
 inline void store(int32_t* at, Ints value) { *reinterpret_cast<Ints*>(at) = value; }
 
-// GCC makes two instructions of the comparison and the choice where the processor has one.
+// The same at any address.
+typedef float UnalignedFloats __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
+inline Floats load_anywhere(const float* at) { return *reinterpret_cast<const UnalignedFloats*>(at); }
+inline void store_anywhere(float* at, Floats value) { *reinterpret_cast<UnalignedFloats*>(at) = value; }
+
+// GCC makes two instructions of the comparison and the choice where the processor has one. (With a mask of all lanes, which
+// it drops again, because it says of the header's plain form that it reads what was never set.)
 inline Floats min(Floats a, Floats b) {
 #if defined(__AVX512F__) && SPLASH_LANES == 16
-    return (Floats)_mm512_min_ps((__m512)a, (__m512)b);
+    return (Floats)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b);
 #elif defined(__AVX__) && SPLASH_LANES == 8
     return (Floats)_mm256_min_ps((__m256)a, (__m256)b);
 #elif defined(__SSE2__) && SPLASH_LANES == 4
@@ -43,7 +49,7 @@ inline Floats min(Floats a, Floats b) {
 
 inline Floats max(Floats a, Floats b) {
 #if defined(__AVX512F__) && SPLASH_LANES == 16
-    return (Floats)_mm512_max_ps((__m512)a, (__m512)b);
+    return (Floats)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b);
 #elif defined(__AVX__) && SPLASH_LANES == 8
     return (Floats)_mm256_max_ps((__m256)a, (__m256)b);
 #elif defined(__SSE2__) && SPLASH_LANES == 4

@@ -32,22 +32,23 @@ class Pool {
         std::unique_lock<std::mutex> mine(busy_, std::try_to_lock);
         if (!mine.owns_lock()) return false;
         start_threads(workers - 1);
+        uint64_t number;
         {
             std::lock_guard<std::mutex> lock(mutex_);
             work_ = work;
             argument_ = argument;
-            workers_ = workers;
             failed_.store(false, std::memory_order_relaxed);
-            running_.store(threads_, std::memory_order_relaxed);
-            call_.fetch_add(1, std::memory_order_release);
+            unfinished_.store(workers, std::memory_order_relaxed);
+            number = call_.load(std::memory_order_relaxed) + 1;
+            unclaimed_.store(number << WORKER_BITS | static_cast<uint64_t>(workers), std::memory_order_release);
+            call_.store(number, std::memory_order_release);
         }
         wake_.notify_all();
-        call(0);
-        for (int worker = threads_ + 1; worker < workers; ++worker) call(worker);
-        for (int spin = 0; spin < SPINS && running_.load(std::memory_order_acquire) != 0; ++spin) pause();
-        if (running_.load(std::memory_order_acquire) != 0) {
+        take_part(number);
+        for (int spin = 0; spin < SPINS && unfinished_.load(std::memory_order_acquire) != 0; ++spin) pause();
+        if (unfinished_.load(std::memory_order_acquire) != 0) {
             std::unique_lock<std::mutex> lock(mutex_);
-            done_.wait(lock, [&] { return running_.load(std::memory_order_acquire) == 0; });
+            done_.wait(lock, [&] { return unfinished_.load(std::memory_order_acquire) == 0; });
         }
         if (failed_.load(std::memory_order_relaxed)) throw std::bad_alloc();
         return true;
@@ -58,7 +59,7 @@ class Pool {
     void start_threads(int wanted) {
         while (threads_ < wanted) {
             try {
-                std::thread(&Pool::loop, this, call_.load(std::memory_order_relaxed), threads_ + 1).detach();
+                std::thread(&Pool::loop, this, call_.load(std::memory_order_relaxed)).detach();
             } catch (const std::system_error&) {
                 break;
             }
@@ -66,15 +67,26 @@ class Pool {
         }
     }
 
-    void call(int worker) {
-        try {
-            work_(argument_, worker);
-        } catch (...) {
-            failed_.store(true, std::memory_order_relaxed);
+    // Does the work of workers that nobody has claimed yet. Whoever comes first claims the most, the caller often all of
+    // them: a thread that the system wakes late, because the processors are busy, is not waited for.
+    void take_part(uint64_t number) {
+        uint64_t left = unclaimed_.load(std::memory_order_acquire);
+        while (left >> WORKER_BITS == number && (left & WORKER_MASK) != 0) {
+            if (!unclaimed_.compare_exchange_weak(left, left - 1, std::memory_order_acq_rel)) continue;
+            try {
+                work_(argument_, static_cast<int>((left & WORKER_MASK) - 1));
+            } catch (...) {
+                failed_.store(true, std::memory_order_relaxed);
+            }
+            if (unfinished_.fetch_sub(1, std::memory_order_acq_rel) == 1) {
+                std::lock_guard<std::mutex> lock(mutex_);
+                done_.notify_one();
+            }
+            left = unclaimed_.load(std::memory_order_acquire);
         }
     }
 
-    void loop(uint64_t seen, int worker) {
+    void loop(uint64_t seen) {
         for (;;) {
             for (int spin = 0; spin < SPINS && call_.load(std::memory_order_acquire) == seen; ++spin) pause();
             if (call_.load(std::memory_order_acquire) == seen) {
@@ -82,22 +94,22 @@ class Pool {
                 wake_.wait(lock, [&] { return call_.load(std::memory_order_acquire) != seen; });
             }
             seen = call_.load(std::memory_order_acquire);
-            if (worker < workers_) call(worker);
-            if (running_.fetch_sub(1, std::memory_order_acq_rel) == 1) {
-                std::lock_guard<std::mutex> lock(mutex_);
-                done_.notify_one();
-            }
+            take_part(seen);
         }
     }
 
+    // Workers left to claim in the low bits, the call's number above: a thread that comes late finds another number.
+    static constexpr int WORKER_BITS = 8;
+    static constexpr uint64_t WORKER_MASK = (uint64_t(1) << WORKER_BITS) - 1;
+    static_assert(MAX_THREADS <= int(WORKER_MASK), "the workers of a call are counted in WORKER_BITS");
+
     std::mutex busy_, mutex_;
     std::condition_variable wake_, done_;
-    std::atomic<uint64_t> call_{0};
-    std::atomic<int> running_{0};
+    std::atomic<uint64_t> call_{0}, unclaimed_{0};
+    std::atomic<int> unfinished_{0};
     std::atomic<bool> failed_{false};
     void (*work_)(void*, int) = nullptr;
     void* argument_ = nullptr;
-    int workers_ = 0;
     int threads_ = 0;
 };
 

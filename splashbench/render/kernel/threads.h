@@ -9,9 +9,9 @@ namespace splash {
 
 constexpr int MAX_THREADS = 64;
 
-// Calls work(argument, worker) for every worker in [0, workers), the first on the calling thread, and waits. The others
-// run on threads that are kept between calls. While somebody else uses these, all workers run here, one by one: work
-// must not wait for other workers. Rethrows std::bad_alloc.
+// Calls work(argument, worker) for every worker in [0, workers), on this thread and on others that are kept between calls,
+// and waits. One thread may do the work of several workers, one after another, and does while somebody else uses the
+// threads: work must not wait for other workers. Rethrows std::bad_alloc.
 void run_on_workers(int workers, void (*work)(void*, int), void* argument);
 
 template <class Work>

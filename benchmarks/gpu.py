@@ -1,6 +1,6 @@
 """The renderer's CUDA backend on a machine that has a GPU: its tests, its images and its speed beside the CPU's.
 
-    python benchmarks/cuda.py [--json FILE] [--repeats N]
+    python benchmarks/gpu.py [--json FILE] [--repeats N]
 
 One command for everything that a machine without a GPU cannot show. It runs the tests marked cuda, then renders scenes
 iii, i and ii of benchmarks/render.py with both backends in turn. Without a GPU, or without gsplat 1.5.3, it says so in

@@ -1,0 +1,64 @@
+"""The colour loss over seen pixels, with its gradient, compiled: torch's passes over large images cost more."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from splashbench_methods.scaffold_gs.plate import Plate
+
+from splashbench.parallel import over_range
+
+_SMALLEST_ROWS = 32
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rows(
+    image: np.ndarray,
+    target: np.ndarray,
+    seen: np.ndarray,
+    scale: float,
+    totals: np.ndarray,
+    gradient: np.ndarray,
+    start: int,
+    stop: int,
+) -> None:
+    """Sums of absolute differences per row, and scale times their derivative by the image."""
+    step = np.float32(scale)
+    for y in range(start, stop):
+        total = 0.0
+        for x in range(image.shape[1]):
+            for c in range(3):
+                gradient[y, x, c] = 0
+                if seen[y, x]:
+                    difference = image[y, x, c] - target[y, x, c] * np.float32(1 / 255)
+                    total += abs(difference)
+                    gradient[y, x, c] = step * np.sign(difference)
+        totals[y] = total
+
+
+class _L1(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: torch.Tensor, plate: Plate) -> torch.Tensor:
+        rendered = np.ascontiguousarray(image.detach().numpy())
+        scale = 1 / max(1, 3 * int(np.count_nonzero(plate.seen)))
+        totals, gradient = np.empty(len(rendered)), np.empty_like(rendered)
+        over_range(
+            _rows, len(rendered), rendered, plate.image, plate.seen, scale, totals, gradient, smallest=_SMALLEST_ROWS
+        )
+        ctx.gradient = torch.from_numpy(gradient)
+        return image.new_tensor(totals.sum() * scale)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, outer: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return outer * ctx.gradient, None
+
+
+def l1(image: torch.Tensor, plate: Plate) -> torch.Tensor:
+    """Mean absolute difference of a float32 image [H, W, 3] in [0, 1] to a plate of its size, over its seen pixels."""
+    if image.shape != plate.image.shape:
+        raise ValueError(f"an image of {tuple(image.shape)} does not compare with a plate of {plate.image.shape}")
+    return _L1.apply(image, plate)

@@ -1,0 +1,235 @@
+"""The jet: liquid in the air falls freely, and gravity is known.
+
+The hull's surface says little of how fast a steady stream runs through it: nothing visible moves. Its shape does. In
+free fall the path of a steady jet bends by g / (2 v_h^2) and its cross-section thins as 1 / speed, and its first drop
+and its last fall as any stone does. One vertical speed w at one height explains all of these; it is found by trying
+speeds, the horizontal motion following linearly. Not in the paper, which fits all motion by level sets.
+
+Coordinates are upright (pool.py): horizontal two, then height. Scene units and seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splashbench.scene.camera import Camera
+
+# What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, and of the
+# height of a tip or tail (voxels).
+_MIDDLE, _AREA, _END = 0.1, 0.2, 2.0
+# Neighbouring slices err alike: so many of them count as one.
+_ALIKE = 4
+_SLICES_AT_LEAST = 8
+# Slices are no jet's where their middles lie off its axis by this many voxels, or the logarithm of what passes through
+# them differs by so much, in the median.
+_ASTRAY, _UNEVEN = 0.5, 0.3
+# A body of liquid is so many times as wide, in area, as the stream above it.
+_BODY = 4.0
+# A jet is taken as steady over so many frames.
+_STEADY = 3
+# Speeds tried, up to so many times that of a fall through all that is seen.
+_SPEEDS, _FASTEST = 80, 4.0
+
+
+@dataclass(frozen=True)
+class Slices:
+    """The airborne part of one frame's hull, cut by height.
+
+    height: [n] of the slices, scene units, ascending. middle: [n, 2]. area: [n], square scene units.
+    """
+
+    height: np.ndarray
+    middle: np.ndarray
+    area: np.ndarray
+
+    def above(self, floor: float) -> Slices:
+        """The slices higher than `floor`."""
+        high = self.height > floor
+        return Slices(self.height[high], self.middle[high], self.area[high])
+
+
+def slices_of(points: np.ndarray, filled: np.ndarray, voxel: float) -> Slices:
+    """Cut a hull into slices one voxel thick, at the same heights in every frame.
+
+    points: [N, 3] nodes of a grid, upright, `voxel` apart. filled: [N] share of each node's voxel within the hull.
+    """
+    if len(points) == 0:
+        return Slices(np.zeros(0), np.zeros((0, 2)), np.zeros(0))
+    number = np.floor(points[:, 2] / voxel).astype(np.int64)
+    lowest = int(number.min())
+    count = np.bincount(number - lowest, filled)
+    used = np.nonzero(count > 0.5)[0]
+    middle = np.stack([np.bincount(number - lowest, filled * points[:, a])[used] / count[used] for a in (0, 1)], axis=1)
+    return Slices((lowest + used + 0.5) * voxel, middle, count[used] * voxel**2)
+
+
+def open_floor(frames: Sequence[Slices], voxel: float) -> float:
+    """Height above which the liquid is a stream and no body, where no container tells: scene units, inf for none.
+
+    Going down from the top, the stream ends where the usual cross-section is several times what it was above.
+    """
+    whole = _merged(list(frames), voxel)
+    for n in range(len(whole.height) - _SLICES_AT_LEAST, -1, -1):
+        if whole.area[n] > _BODY * np.median(whole.area[n + 1 :]):
+            return float(whole.height[n] + 2 * voxel)
+    return float(whole.height[0]) if len(whole.height) else float("inf")
+
+
+def framed(slices: Slices, cameras: Sequence[Camera], turn: np.ndarray) -> Slices:
+    """The slices that all cameras see whole: the others are cut by the edge of an image, and say too little.
+
+    turn: [3, 3] scene axes to upright ones.
+    """
+    seen = np.ones(len(slices.height), dtype=bool)
+    radius = np.sqrt(slices.area / np.pi)
+    for rise in (-1.0, 1.0):
+        points = np.concatenate([slices.middle, (slices.height + rise * radius)[:, None]], axis=1) @ turn
+        for camera in cameras:
+            pixels, depth = camera.project(points)
+            reach = 1.5 * radius * camera.K[0, 0] / np.maximum(depth, 1e-9)
+            size = np.array([camera.width, camera.height])
+            seen &= (depth > 0) & ((pixels > reach[:, None]) & (pixels < size - reach[:, None])).all(axis=1)
+    return Slices(slices.height[seen], slices.middle[seen], slices.area[seen])
+
+
+@dataclass(frozen=True)
+class Jet:
+    """A steady jet. At height `top` its liquid passes `middle` [2] with velocity (`drift` [2], -`speed`).
+
+    gravity: scene units / s^2. radius: of its cross-section at the top, scene units.
+    """
+
+    top: float
+    middle: np.ndarray
+    drift: np.ndarray
+    speed: float
+    gravity: float
+    radius: float
+
+    def fall_time(self, height: np.ndarray) -> np.ndarray:
+        """Seconds from `top` down to `height` (negative above it, as far as the jet can have risen)."""
+        square = np.maximum(self.speed**2 + 2 * self.gravity * (self.top - np.asarray(height)), (0.2 * self.speed) ** 2)
+        return (np.sqrt(square) - self.speed) / self.gravity
+
+    def velocity(self, height: np.ndarray) -> np.ndarray:
+        """[..., 3] upright velocity of its liquid at `height` [...]."""
+        down = self.speed + self.gravity * self.fall_time(height)
+        return np.stack([np.full_like(down, self.drift[0]), np.full_like(down, self.drift[1]), -down], axis=-1)
+
+    def axis(self, height: np.ndarray) -> np.ndarray:
+        """[..., 2] middle of the jet at `height` [...]."""
+        return self.middle + self.fall_time(height)[..., None] * self.drift
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance of upright `points` [N, 3] to the jet's side, negative within, scene units (horizontal)."""
+        down = self.speed + self.gravity * self.fall_time(points[:, 2])
+        radius = self.radius * np.sqrt(self.speed / np.maximum(down, 1e-9))
+        return np.linalg.norm(points[:, :2] - self.axis(points[:, 2]), axis=1) - radius
+
+
+def fit_jets(frames: list[Slices], times: np.ndarray, gravity: float, voxel: float) -> list[Jet | None]:
+    """The jet in each frame; None where no frame nearby shows one.
+
+    All frames share the speed at one height; the nozzle may wander, so that its place and the drift are found for
+    every few frames. gravity: scene units / s^2; voxel: scene units.
+    """
+    groups = [_merged(frames[start : start + _STEADY], voxel) for start in range(0, len(frames), _STEADY)]
+    used = [number for number, group in enumerate(groups) if len(group.height) >= _SLICES_AT_LEAST]
+    if not used:
+        return [None] * len(frames)
+    streams = [groups[number] for number in used]
+    top = max(float(stream.height[-1]) for stream in streams)
+    bottom = min(float(stream.height[0]) for stream in streams)
+    ends = _falls(frames, times, voxel, top, bottom)
+    fastest = _FASTEST * np.sqrt(2 * gravity * (top - bottom + voxel))
+    speeds = np.geomspace(fastest / 300, fastest, _SPEEDS)
+    tried = (_explained(streams, ends, float(speed), top, gravity, voxel) for speed in speeds)
+    _, speed, paths = min(tried, key=lambda explained: explained[0])
+    found = {number: path for number, path in zip(used, paths) if path is not None}
+    jets: list[Jet | None] = []
+    for t in range(len(frames)):
+        near = [number for number in found if abs(number - t // _STEADY) <= 1]
+        if near:
+            path, radius = found[min(near, key=lambda number: abs(number - t // _STEADY))]
+            jets.append(Jet(top, path[0], path[1], speed, gravity, radius))
+        else:
+            jets.append(None)
+    return jets
+
+
+def _merged(frames: list[Slices], voxel: float) -> Slices:
+    """The slices of several frames as one frame's, by their medians."""
+    height = np.concatenate([frame.height for frame in frames])
+    middle, area = np.concatenate([frame.middle for frame in frames]), np.concatenate([frame.area for frame in frames])
+    levels, number = np.unique(np.round(height / voxel, 3), return_inverse=True)
+    middles = [np.median(middle[number == n], axis=0) for n in range(len(levels))]
+    areas = [np.median(area[number == n]) for n in range(len(levels))]
+    return Slices(levels * voxel, np.array(middles).reshape(-1, 2), np.array(areas))
+
+
+Path = tuple[np.ndarray, float]
+
+
+def _explained(
+    groups: list[Slices], ends: list[np.ndarray], speed: float, top: float, gravity: float, voxel: float
+) -> tuple[float, float, list[Path | None]]:
+    """How badly a vertical `speed` at height `top` explains everything, the speed, and each group's path and radius;
+    None for a group whose slices are no jet's, but drops at different places, or a lump."""
+    cost = _fall_cost(ends, top, speed, gravity, voxel)
+    paths: list[Path | None] = []
+    for group in groups:
+        tau = (np.sqrt(speed**2 + 2 * gravity * (top - group.height)) - speed) / gravity
+        design = np.stack([np.ones_like(tau), tau], axis=1)
+        path = _robust(design, group.middle, _MIDDLE * voxel)
+        error = np.linalg.norm(group.middle - design @ path, axis=1) / (_MIDDLE * voxel)
+        flow = np.sqrt((speed + gravity * tau) ** 2 + (path[1] ** 2).sum())
+        thinning = np.log(group.area * flow)
+        spread = np.abs(thinning - np.median(thinning)) / _AREA
+        cost += float((np.minimum(error**2, 9) + np.minimum(spread**2, 9)).sum()) / _ALIKE
+        # The volume that passes is one at all heights: it gives the radius at the top.
+        area = np.exp(np.median(thinning)) / np.sqrt(speed**2 + (path[1] ** 2).sum())
+        steady = np.median(error) * _MIDDLE < _ASTRAY and np.median(spread) * _AREA < _UNEVEN
+        paths.append((path, float(np.sqrt(area / np.pi))) if steady else None)
+    return cost, speed, paths
+
+
+def _robust(design: np.ndarray, values: np.ndarray, sigma: float) -> np.ndarray:
+    """Least squares with outliers weighted down (Cauchy): drops that fly beside the jet."""
+    weight = np.ones(len(design))
+    for _ in range(8):
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq(design * root, values * root, rcond=None)[0]
+        residual = np.linalg.norm(values - design @ solution, axis=1)
+        weight = 1 / (1 + (residual / sigma) ** 2)
+    return solution
+
+
+def _falls(frames: list[Slices], times: np.ndarray, voxel: float, top: float, bottom: float) -> list[np.ndarray]:
+    """Runs of (time, height) of the jet's first drop, and of its last, while both ends are in the air."""
+    runs: list[list[tuple[float, float]]] = []
+    for lower in (True, False):
+        run: list[tuple[float, float]] = []
+        for frame, time in zip(frames, times):
+            end = None if len(frame.height) == 0 else float(frame.height[0] if lower else frame.height[-1])
+            free = end is not None and bottom + 2 * voxel < end < top - 2 * voxel
+            if run and not (free and end is not None and end < run[-1][1] - voxel):
+                runs.append(run)
+                run = []
+            if free and end is not None:
+                run.append((float(time), end))
+        runs.append(run)
+    return [np.array(run) for run in runs if len(run) >= 2]
+
+
+def _fall_cost(runs: list[np.ndarray], top: float, speed: float, gravity: float, voxel: float) -> float:
+    """Squared errors of the ends' fall, over _END voxels; each run starts when it likes."""
+    cost = 0.0
+    for run in runs:
+        fallen = (np.sqrt(np.maximum(speed**2 + 2 * gravity * (top - run[:, 1]), 0)) - speed) / gravity
+        lasted = np.maximum(run[:, 0] - np.median(run[:, 0] - fallen), 0)
+        error = (top - speed * lasted - 0.5 * gravity * lasted**2 - run[:, 1]) / (_END * voxel)
+        cost += float(np.minimum(error**2, 9).sum())
+    return cost

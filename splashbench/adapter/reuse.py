@@ -1,0 +1,104 @@
+"""A part of a fit that several runs share, such as a frozen background: fitted once, then loaded.
+
+Only where the harness gives a run a folder for it (`Run.cache`), as a study does for its variants; ordinary runs fit
+everything. The seconds that the part took when it was fitted stay with it, so that no run's fit time leaves them out.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from splashbench.files import atomic_directory, read_model, sha256_file, write_model
+from splashbench.scene import TrainingScene
+from splashbench.version import __version__
+
+T = TypeVar("T")
+
+_FACTS = "reuse.json"
+
+
+class Facts(BaseModel):
+    """reuse.json: what the part is, by everything it depends on, and how long its fit took."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str
+    key: dict[str, Any]
+    seconds: float = Field(ge=0)
+
+
+@dataclass(frozen=True)
+class Part(Generic[T]):
+    """A part of a fit, had by `reuse`.
+
+    Attributes:
+        value: what was fitted or loaded.
+        loaded_seconds: how long its fit took in the earlier run it comes from; None where it was fitted now.
+        overhead_seconds: time spent on waiting, reading and writing, which an ordinary run would not spend.
+    """
+
+    value: T
+    loaded_seconds: float | None
+    overhead_seconds: float
+
+
+def reuse(
+    cache: Path,
+    name: str,
+    scene: TrainingScene,
+    key: Mapping[str, Any],
+    fit: Callable[[], T],
+    save: Callable[[T, Path], None],
+    load: Callable[[Path], T],
+) -> Part[T]:
+    """The part `name` from the folder `cache`, fitted and kept there where it is not yet.
+
+    key: what it depends on besides the scene, in values that JSON has. save and load: as in `Fitted.save` and
+    `Method.load`, from a folder of its own. Of runs at the same time one fits and the others wait.
+    """
+    start = time.perf_counter()
+    whole = {"splashbench": __version__, "scene": training_digest(scene), **key}
+    digest = hashlib.sha256(json.dumps([name, whole], sort_keys=True).encode()).hexdigest()[:16]
+    place = Path(cache, f"{name}-{digest}")
+    with alone(place.with_suffix(".lock")):
+        if (place / _FACTS).is_file():
+            value, facts = load(place), read_model(place / _FACTS, Facts)
+            return Part(value, facts.seconds, time.perf_counter() - start)
+        before_fit = time.perf_counter()
+        value = fit()
+        after_fit = time.perf_counter()
+        with atomic_directory(place) as staging:
+            save(value, staging)
+            write_model(staging / _FACTS, Facts(name=name, key=whole, seconds=after_fit - before_fit))
+        return Part(value, None, time.perf_counter() - start - (after_fit - before_fit))
+
+
+def training_digest(scene: TrainingScene) -> str:
+    """SHA-256 over every file below the scene's folder: all that a method can have read."""
+    digest = hashlib.sha256()
+    for root, folders, names in os.walk(scene.directory):
+        folders.sort()
+        for name in sorted(names):
+            path = Path(root, name)
+            entry = [path.relative_to(scene.directory).as_posix(), sha256_file(path)]
+            digest.update(json.dumps(entry).encode())
+    return digest.hexdigest()
+
+
+@contextmanager
+def alone(lock: Path) -> Iterator[None]:
+    """Hold the file `lock` meanwhile, waiting for it; the kernel lets go of it for a process that is killed."""
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("wb") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield

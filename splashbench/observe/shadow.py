@@ -1,0 +1,166 @@
+"""Carving around a container: what it hides is no evidence of absence, and its walls hold no liquid.
+
+A view whose line of sight to x the container blocks says nothing about x; x must be seen by two views all the same.
+In a view the hidden pixels join the silhouette, at each depth those that are hidden there, so that phi keeps its
+sub-voxel outline where the view sees and does not break off where the container begins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splashbench.observe.container import depth_image, hidden, solid_distance
+from splashbench.observe.grid import Grid
+from splashbench.observe.kernels import carve_hidden_view
+from splashbench.observe.silhouettes import NO_EVIDENCE, Silhouettes, Window, inner_distance, signed_distance_2d
+from splashbench.scene.camera import Camera
+from splashbench.scene.container import ContainerMesh
+from splashbench.scene.scene import Scene, TrainingScene
+
+#: phi is clipped to this many voxels: nothing farther from the interface matters to transport, carriers or opacity
+LIMIT_VOXELS = 20.0
+# Of what is hidden, between the nearest and the farthest surface of the container.
+_LAYERS = 4
+# Stored in eighths of a pixel, to halve the memory.
+_PER_PIXEL = 8
+_FARTHEST_PIXELS = 4000.0
+# Voxels behind the mesh's surface where its shadow begins, for errors of the mesh and of its place.
+_TOLERANCE_VOXELS = 1.0
+
+
+def focal_length(camera: Camera) -> float:
+    """Pixels per unit of x / z, the mean of both axes: one pixel at depth z spans z / f scene units."""
+    return 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class ContainerShadow:
+    """The container as carving needs it.
+
+    mesh: in scene units. gravity: unit vector [3] or None; where known, no liquid lies deeper than the mesh's lowest
+    point, on which the container stands. hides: False for a transparent container, which blocks no line of sight.
+    """
+
+    mesh: ContainerMesh
+    gravity: np.ndarray | None = None
+    hides: bool = True
+
+    @classmethod
+    def of(cls, scene: Scene | TrainingScene) -> ContainerShadow | None:
+        """The container of `scene`, or None where it has no mesh."""
+        mesh = scene.container_mesh()
+        if mesh is None:
+            return None
+        return cls(mesh, scene.gravity, hides=not scene.container_transparent)
+
+    def forbidden(self, grid: Grid) -> np.ndarray:
+        """Signed distance, in voxels, into where the container allows liquid: > 0 in its walls and below its foot."""
+        distance = -solid_distance(self.mesh, grid)
+        if self.gravity is not None:
+            floor = float((self.mesh.vertices @ self.gravity).max())
+            i, j, k = (np.arange(n) * grid.voxel * g for n, g in zip(grid.shape, self.gravity))
+            start = float(grid.origin @ self.gravity) - floor
+            depth = (start + i[:, None, None] + j[:, None] + k) / grid.voxel
+            np.maximum(distance, depth.astype(np.float32), out=distance)
+        return np.clip(distance, -LIMIT_VOXELS, LIMIT_VOXELS)
+
+
+class ViewShadow:
+    """What the container hides from one view: its depth, and the hidden pixels at growing depths."""
+
+    def __init__(self, camera: Camera, mesh: ContainerMesh, window: Window) -> None:
+        """window: of the view's silhouette; the shadow's own holds it and the whole container."""
+        import cv2
+
+        self.camera = camera
+        depth = depth_image(mesh, camera)
+        # A pixel wider, as mask and mesh never meet exactly.
+        depth = cv2.erode(depth, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+        covered = np.isfinite(depth)
+        if covered.any():
+            window = window.joined(Window.around(covered))
+        self.window = window
+        self.nearest = np.ascontiguousarray(depth[window.slices])
+        found = self.nearest[np.isfinite(self.nearest)]
+        quantiles = np.unique(np.quantile(found, np.arange(1, _LAYERS) / _LAYERS)) if len(found) else np.zeros(0)
+        #: depths from which each layer but the first counts
+        self.starts = np.append(quantiles, found.max() * (1 + 1e-6)) if len(found) else np.zeros(0)
+        self._hidden = np.zeros((len(self.starts), *self.nearest.shape), dtype=np.int16)
+        for layer, start in enumerate(self.starts):
+            pixels = np.clip(signed_distance_2d(self.nearest < start), -_FARTHEST_PIXELS, _FARTHEST_PIXELS)
+            self._hidden[layer] = np.rint(pixels * _PER_PIXEL)
+
+    def hidden_at(self, layer: int) -> np.ndarray:
+        """Signed distance in pixels to what is hidden at layer number `layer`, from 1: float32 [h, w], < 0 there."""
+        return self._hidden[layer - 1].astype(np.float32) / np.float32(_PER_PIXEL)
+
+    def hides(self, points: np.ndarray, grid: Grid) -> np.ndarray:
+        """bool [n]: whether the view cannot see `points` [n, 3] in scene units, as far as `grid` resolves it."""
+        (x0, y0), (height, width) = self.window.corner, self.window.shape
+        camera = self.camera.cropped(int(x0), int(y0), width, height)
+        return hidden(points, self.nearest, camera, _TOLERANCE_VOXELS * grid.voxel)
+
+    def visibility(self) -> np.ndarray:
+        """How far each pixel lies within what is seen at each layer: float32 [K + 1, h, w] pixels, < 0 where hidden."""
+        layers = np.full((len(self.starts) + 1, *self.nearest.shape), _FARTHEST_PIXELS, dtype=np.float32)
+        for layer in range(1, len(layers)):
+            layers[layer] = self.hidden_at(layer)
+        return layers
+
+    def evidence(self, silhouette: np.ndarray) -> np.ndarray:
+        """`silhouette` (signed distance in pixels [h, w]) joined with what is hidden, at each layer: [K + 1, h, w]."""
+        layers = np.empty((len(self.starts) + 1, *silhouette.shape), dtype=np.float32)
+        layers[0] = silhouette
+        liquid = silhouette < 0
+        for layer in range(1, len(layers)):
+            behind = self.hidden_at(layer)
+            either = liquid | (behind < 0)
+            joined = np.minimum(silhouette, behind)
+            # Where the two meet, the outline of neither is one of their union. (A view that says nothing has none.)
+            own = liquid & ((behind > -silhouette) | (silhouette <= NO_EVIDENCE))
+            layers[layer] = np.where(either & ~own, -inner_distance(either), joined)
+        return layers
+
+    def carve(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, second: np.ndarray | None = None) -> None:
+        """phi = max(phi, what `layers` say), in place, in voxels of `grid`; see `carve_hidden_view`."""
+        carve_hidden_view(
+            phi,
+            grid.origin,
+            grid.voxel,
+            self.camera.projection,
+            focal_length(self.camera),
+            layers,
+            self.window.corner,
+            self.nearest,
+            self.starts,
+            _TOLERANCE_VOXELS * grid.voxel,
+            LIMIT_VOXELS,
+            second,
+        )
+
+
+class CarvingContainer:
+    """A `ContainerShadow` made ready for the views of `silhouettes` on `grid`.
+
+    Attributes:
+        outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say.
+        views: what it hides from each view; empty for a container that hides nothing.
+    """
+
+    def __init__(self, container: ContainerShadow, silhouettes: Silhouettes, grid: Grid) -> None:
+        self.outside = container.forbidden(grid)
+        self.views: list[ViewShadow] = []
+        if container.hides:
+            for camera, window in zip(silhouettes.cameras, silhouettes.windows):
+                self.views.append(ViewShadow(camera, container.mesh, window))
+            np.maximum(self.outside, -self._seen_twice(grid), out=self.outside)
+
+    def _seen_twice(self, grid: Grid) -> np.ndarray:
+        """Voxels by which a node lies within what at least two views see; < 0 where fewer do."""
+        best = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32)
+        second = best.copy()
+        for shadow in self.views:
+            shadow.carve(best, grid, shadow.visibility(), second)
+        return second

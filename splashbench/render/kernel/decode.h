@@ -1,0 +1,109 @@
+// Carriers to Gaussians (paper, "Decoding Carriers into Gaussians"; ../decode.py has the equations).
+//
+// Carriers are worked on in blocks of BLOCK, one carrier a lane, each quantity a row of BLOCK floats. The heads' weights
+// are packed into two matrices, so that a block passes through all heads by two products:
+//     first  [7K + H, F + 4]: offset, scale, opacity and hidden rows by features, viewing direction and one,
+//     second [3K, H + 1]: colour by hidden units and one.
+// The columns for one hold the biases; the linear heads' columns for the direction are zero, and their gradient unused.
+#pragma once
+
+#include <cstdint>
+
+#include "api.h"
+#include "buffer.h"
+#include "simd.h"
+
+namespace splash {
+
+constexpr int BLOCK = 64;
+// Sums over carriers are taken piece by piece and then in the pieces' order, whoever computed them.
+constexpr int BLOCKS_PER_PIECE = 8;
+static_assert(BLOCK % (2 * LANES) == 0, "whole tiles of multiply.h");
+
+inline int in_vectors(int count) { return (count + LANES - 1) / LANES * LANES; }
+
+// Where a block's quantities stand, in rows of BLOCK floats: what the backward pass needs of the forward pass.
+struct Rows {
+    explicit Rows(const SplashHeads& heads)
+        : k(heads.children),
+          offset(0),
+          scale(3 * k),
+          opacity(6 * k),
+          hidden(7 * k),
+          one(hidden + heads.hidden),
+          color(one + 1),
+          extent(color + 3 * k),
+          base(extent + 3 * k),
+          fade(base + 3),
+          direction(fade + 1),
+          deformation(direction + 3),
+          total(deformation + 9) {}
+
+    int k;
+    int offset, scale;  // 3K each: tanh of the heads' answers, tanh of half of them
+    int opacity;        // K, before the fade
+    int hidden, one;    // H after the ReLU; then ones
+    int color, extent;  // 3K each
+    int base;           // 3
+    int fade;           // 1, visibility included
+    int direction;      // 3
+    int deformation;    // 9
+    int total;
+};
+
+struct Weights {
+    explicit Weights(const SplashHeads& heads);
+
+    SplashHeads heads;
+    int inputs, outputs;            // F + 4, 7K + H
+    int first_step, second_step;    // floats in a row of each matrix
+    Buffer<float> first, second;
+};
+
+// The carriers of one block.
+struct Part {
+    int64_t begin;
+    int count;
+};
+
+inline int64_t blocks_of(int64_t carriers) { return (carriers + BLOCK - 1) / BLOCK; }
+inline int64_t pieces_of(int64_t carriers) { return (blocks_of(carriers) + BLOCKS_PER_PIECE - 1) / BLOCKS_PER_PIECE; }
+inline Part part_of(int64_t carriers, int64_t block) {
+    const int64_t begin = block * BLOCK;
+    return {begin, static_cast<int>(carriers - begin < BLOCK ? carriers - begin : BLOCK)};
+}
+
+// The row of the tables that carrier i has.
+inline int64_t row_of(const SplashCarriers& c, int64_t i) { return c.rows == nullptr ? i : c.rows[i]; }
+
+// Asks for the features of the carrier one block after carrier i: rows lie all over the table.
+inline void prefetch_features(const SplashCarriers& c, int size, int64_t i) {
+    if (i + BLOCK >= c.count) return;
+    const float* const next = c.features + row_of(c, i + BLOCK) * size;
+    for (int j = 0; j < size; j += 16) prefetch(next + j);
+}
+
+// rows[j][i] = source[i][j] for `count` rows of `width` floats; lanes beyond them are zero, and so are all without a source.
+inline void to_lanes(const float* source, int width, int count, float* rows) {
+    if (source == nullptr) count = 0;
+    for (int i = 0; i < count; ++i) {
+        for (int j = 0; j < width; ++j) rows[j * BLOCK + i] = source[i * width + j];
+    }
+    for (int j = 0; j < width; ++j) {
+        for (int i = count; i < BLOCK; ++i) rows[j * BLOCK + i] = 0.0f;
+    }
+}
+
+// target[i][j] = rows[j][i] for `count` rows of `width` floats, `step` floats apart.
+inline void from_lanes(const float* rows, int width, int count, float* target, int step) {
+    for (int i = 0; i < count; ++i) {
+        for (int j = 0; j < width; ++j) target[i * step + j] = rows[j * BLOCK + i];
+    }
+}
+
+void decode(const Weights&, const SplashCarriers&, const SplashChildren&, float* kept, float* cell_colors,
+            double penalties[3], int threads);
+void decode_backward(const Weights&, const SplashCarriers&, const float* kept, const float* cell_colors,
+                     const SplashChildren& grad, const double grad_penalties[3], int threads, const SplashDecoderGradients&);
+
+}  // namespace splash

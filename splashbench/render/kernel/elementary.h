@@ -1,0 +1,24 @@
+// Elementary functions of vectors. NaN stays NaN.
+#pragma once
+
+#include "constants.h"
+#include "simd.h"
+
+namespace splash {
+
+// e^x, relative error below 1e-6 for |x| < 10 and below 1e-5 elsewhere; held at 2^-125 and 2^125.
+inline Floats exp(Floats x) {
+    const Floats power = x * LOG2_E;
+    // Where an operand is NaN, min and max give the second one.
+    return exp2(max(all(-125.0f), min(all(125.0f), power)));
+}
+
+// 1 / (1 + e^-x)
+inline Floats sigmoid(Floats x) { return 1.0f / (1.0f + exp(-x)); }
+
+// Absolute error below 1e-6.
+inline Floats tanh(Floats x) { return 1.0f - 2.0f / (1.0f + exp(x + x)); }
+
+inline Floats absolute(Floats x) { return max(x, -x); }
+
+}  // namespace splash

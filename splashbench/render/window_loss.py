@@ -1,0 +1,92 @@
+"""Losses of a rendered window against a photograph and its mask, compiled, as a torch function.
+
+With the error e = image - truth, all within the box that the photograph covers:
+
+    foreground = sum over the mask of |e| / (3 pixels in the mask)
+    gradient = sum over pairs of neighbours with at least one in the mask of |e' - e| / (3 such pairs)
+    silhouette = sum over the whole window of |alpha - mask|
+
+Results and gradients do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splashbench.render import cpu, memory, native
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What a camera saw of a box within the window, where alone there is liquid.
+
+    image: uint8 [rows, columns, 3]; mask: bool [rows, columns]; both contiguous, on the CPU. top, left: of the box.
+    """
+
+    image: Tensor
+    mask: Tensor
+    top: int
+    left: int
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the window."""
+        rows, columns = self.mask.shape
+        return slice(self.top, self.top + rows), slice(self.left, self.left + columns)
+
+
+def window_losses(image: Tensor, alpha: Tensor, photograph: Photograph) -> tuple[Tensor, Tensor, Tensor]:
+    """(foreground, gradient, silhouette), scalars; differentiable by `image`, float32 [h, w, 3], and `alpha` [h, w].
+
+    Raises TypeError or ValueError where these do not fit together.
+    """
+    truth, mask = photograph.image, photograph.mask
+    if truth.dtype != torch.uint8 or mask.dtype != torch.bool or not (truth.is_contiguous() and mask.is_contiguous()):
+        raise TypeError(f"the photograph is {truth.dtype} and {mask.dtype}, not contiguous uint8 and bool")
+    if image.dtype != torch.float32 or alpha.dtype != torch.float32 or image.device.type != "cpu":
+        raise TypeError(f"image and alpha are {image.dtype} and {alpha.dtype}, not float32 on the CPU")
+    (rows, columns), (height, width) = mask.shape, alpha.shape
+    if tuple(image.shape) != (height, width, 3) or tuple(truth.shape) != (rows, columns, 3):
+        raise ValueError(f"an image {list(image.shape)} does not go with alpha {list(alpha.shape)}, nor {truth.shape}")
+    inside = 0 <= photograph.top <= height - rows and 0 <= photograph.left <= width - columns
+    if not inside:
+        raise ValueError(
+            f"a box of {columns}x{rows} px at {photograph.left}, {photograph.top} leaves {width}x{height} px"
+        )
+    losses = _WindowLosses.apply(image, alpha, photograph)
+    return losses[0], losses[1], losses[2]
+
+
+def _run(function: Any, photograph: Photograph, image: Tensor, alpha: Tensor, *rest: Any) -> None:
+    (rows, columns), (height, width) = photograph.mask.shape, alpha.shape
+    truth, mask = photograph.image.data_ptr(), photograph.mask.data_ptr()
+    window = native.Window(width, height, photograph.left, photograph.top, columns, rows, truth, mask)
+    status = function(ctypes.byref(window), image.data_ptr(), alpha.data_ptr(), *rest, cpu.kernel_threads())
+    if status != native.DONE:
+        raise MemoryError("the window's losses are out of memory")
+
+
+class _WindowLosses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, photograph: Photograph) -> Tensor:
+        image, alpha = image.contiguous(), alpha.contiguous()
+        losses = (ctypes.c_double * 3)()
+        _run(native.library().splash_window_losses, photograph, image, alpha, losses)
+        ctx.photograph = photograph
+        ctx.save_for_backward(image, alpha)
+        return torch.tensor(list(losses), dtype=torch.float32)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, Tensor, None]:
+        image, alpha = ctx.saved_tensors
+        weights = (ctypes.c_double * 3)(*outer.tolist())
+        by_image, by_alpha = (torch.from_numpy(memory.empty(tuple(t.shape))) for t in (image, alpha))
+        function = native.library().splash_window_gradients
+        _run(function, ctx.photograph, image, alpha, weights, by_image.data_ptr(), by_alpha.data_ptr())
+        return by_image, by_alpha, None

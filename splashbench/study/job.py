@@ -1,0 +1,199 @@
+"""One run of a study: made, scored and written down; `python -m splashbench.study.job PARENT FILE` in its own process.
+
+What it leaves is a result in results/ and an entry in runs/, written last: a run with an entry is whole.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from splashbench.adapter.messages import DISK_FULL_EXIT
+from splashbench.adapter.runner import run_method
+from splashbench.errors import DiskFullError, SplashbenchError, one_line
+from splashbench.files import read_model, write_model
+from splashbench.processes import end_with_parent, terminable
+from splashbench.scene import Scene
+from splashbench.score import Result, score_submission, shared_fields
+from splashbench.score.uniformity import DistanceFields
+from splashbench.study.scenes import changed_scene
+from splashbench.study.spec import Variant
+from splashbench.submission import Record, Status, Submission
+
+#: The status of a run that ended outside its method: in reading the scene, say, or in scoring.
+ERROR = "error"
+
+
+class Job(BaseModel):
+    """What a process is told: a planned run with all its paths."""
+
+    model_config = ConfigDict(extra="forbid")
+    digest: str
+    title: str
+    scene: str
+    variant: Variant
+    seed: int
+    method: str
+    preset: str
+    overrides: dict[str, Any]
+    reference: str | None
+    is_reference: bool
+    device: str
+    timeout_seconds: float | None
+    timing_frames: int
+    lpips_weights: str | None
+    out: str
+    keep: bool
+    at_once: int
+
+
+class Entry(BaseModel):
+    """runs/DIGEST.json: a run that is done. `result` is its file in results/, null where there is none to score.
+
+    at_once: how many runs shared the machine. seconds: all that the run took here, scoring included.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+    schema_version: int = 1
+    digest: str
+    title: str
+    status: str
+    reason: str = ""
+    result: str | None = None
+    record: Record | None = None
+    train_views: list[str] = Field(default_factory=list)
+    at_once: int = 1
+    seconds: float = 0.0
+
+
+class Store:
+    """The folder of a study: where its runs lie, and what is scratch."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = Path(out)
+        self.results, self.runs, self.submissions = self.out / "results", self.out / "runs", self.out / "submissions"
+        self.cache = self.out / "cache"
+
+    def entry(self, digest: str) -> Entry | None:
+        """The entry of the run `digest` and None where there is none that is whole."""
+        path = self.entry_path(digest)
+        if not path.is_file():
+            return None
+        entry = read_model(path, Entry)
+        return entry if entry.result is None or (self.results / entry.result).is_file() else None
+
+    def result(self, entry: Entry) -> Result | None:
+        """The result of an entry, None where it has none."""
+        return Result.load(self.results / entry.result) if entry.result else None
+
+    def entry_path(self, digest: str) -> Path:
+        return self.runs / f"{digest[:16]}.json"
+
+    def reference_path(self, digest: str) -> Path:
+        """The submission of a reference run, kept to score others against."""
+        return self.cache / "references" / digest[:16]
+
+    def reference(self, digest: str) -> Submission | None:
+        """The reference run `digest`, None where it is not there or failed."""
+        path = self.reference_path(digest)
+        if not path.is_dir():
+            return None
+        submission = Submission.open(path)
+        return submission if submission.status == Status.OK else None
+
+
+def carry_out(job: Job) -> Entry:
+    """Make the run, score it, and write both down. What goes wrong is an entry with a status and a reason.
+
+    Raises DiskFullError alone: then no other run would come through either.
+    """
+    store, start = Store(Path(job.out)), time.monotonic()
+    done = Entry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once)
+    try:
+        done = _scored(job, store, done)
+    except DiskFullError:
+        raise
+    except SplashbenchError as error:
+        done = done.model_copy(update={"reason": str(error)})
+    except Exception as error:  # a run of many: the others go on
+        done = done.model_copy(update={"reason": one_line(f"{type(error).__name__}: {error}")})
+    before = store.entry(job.digest)
+    done = done.model_copy(update={"seconds": time.monotonic() - start})
+    write_model(store.entry_path(job.digest), done)
+    if before and before.result and before.result != done.result:
+        (store.results / before.result).unlink(missing_ok=True)
+    return done
+
+
+def _scored(job: Job, store: Store, entry: Entry) -> Entry:
+    original = Scene.open(Path(job.scene))
+    scene = changed_scene(original, job.variant, job.seed, store.cache / "scenes")
+    place = store.reference_path(job.digest) if job.is_reference else store.submissions / job.title
+    submission = run_method(
+        job.method,
+        scene.directory,
+        place,
+        preset=job.preset,
+        overrides=job.overrides,
+        seed=job.seed,
+        device=job.device,
+        timeout_seconds=job.timeout_seconds,
+        timing_frames=job.timing_frames,
+        keep_model=job.keep,
+        replace=True,
+        cache=store.cache / "parts",
+    )
+    if job.is_reference:
+        reference = submission if submission.status == Status.OK else None
+    else:
+        reference = store.reference(job.reference) if job.reference else None
+    weights = Path(job.lpips_weights) if job.lpips_weights else None
+    # The ruler is the scene as it is: worse masks or fewer views must not move what runs are measured by.
+    result = score_submission(scene, submission, reference, weights, fields=_fields(original))
+    saved = result.save(store.results)
+    if not job.keep and not job.is_reference:
+        shutil.rmtree(place)
+    return entry.model_copy(
+        update={
+            "status": result.status,
+            "reason": result.reason,
+            "result": saved.name,
+            "record": submission.record,
+            "train_views": list(scene.train),
+        }
+    )
+
+
+_FIELDS: dict[str, Callable[[], DistanceFields]] = {}
+
+
+def _fields(scene: Scene) -> Callable[[], DistanceFields]:
+    """The scene's distance fields; those of the last scene stay in memory, as its variants come one after another."""
+    if scene.digest not in _FIELDS:
+        _FIELDS.clear()
+        _FIELDS[scene.digest] = shared_fields(scene)
+    return _FIELDS[scene.digest]
+
+
+def main(parent: str, file: str) -> int:
+    """Carry out the job in `file`, for as long as the process `parent` lives."""
+    end_with_parent(int(parent))
+    try:
+        with terminable():
+            carry_out(read_model(Path(file), Job))
+    except DiskFullError as error:
+        print(error, file=sys.stderr)
+        return DISK_FULL_EXIT
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,165 @@
+"""From a spec to the runs it asks for, each with a digest of all it depends on.
+
+A run is told by that digest and not by its row: rows that come to the same thing share a run, and a run that was made
+under another spec counts here too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splashbench.adapter.contract import Method
+from splashbench.adapter.discovery import load_method
+from splashbench.adapter.runner import TIMING_FRAMES, without_nulls
+from splashbench.errors import SplashbenchError
+from splashbench.scene import Scene
+from splashbench.score import PROTOCOL_V1
+from splashbench.study.scenes import changes
+from splashbench.study.spec import StudySpec, Variant
+
+
+@dataclass(frozen=True)
+class Named:
+    """A scene under the name that the study's tables give it."""
+
+    name: str
+    scene: Scene
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A run of the study.
+
+    Attributes:
+        scene, variant, seed: its place in the table; the variant `nothing` is the reference.
+        digest: 64 hex digits over all that the run depends on.
+        method, preset, overrides: what `run_method` is given.
+        reference: digest of the reference run its dpsnr_bg is measured against, None where there is none.
+        timing_frames: renders timed for the frame rate; none where the study does not ask for it.
+    """
+
+    scene: Named
+    variant: Variant
+    seed: int
+    digest: str
+    method: str
+    preset: str
+    overrides: Mapping[str, Any]
+    reference: str | None
+    timing_frames: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a study, and the control runs they are measured against (those of changed scenes are in no row)."""
+
+    spec: StudySpec
+    method: Method
+    preset: str
+    scenes: tuple[Named, ...]
+    references: tuple[Planned, ...]
+    runs: tuple[Planned, ...]
+
+    @property
+    def reference_row(self) -> tuple[Planned, ...]:
+        """The reference on the scenes as they are."""
+        return tuple(run for run in self.references if not run.variant.perturbation and run.variant.train_views is None)
+
+
+def make_plan(spec: StudySpec) -> Plan:
+    """The runs of `spec`, seed by seed. Everything that can be wrong before a run starts is found here.
+
+    Raises SplashbenchError, one line, for a missing scene, an unknown method, preset or setting.
+    """
+    method = load_method(spec.method)
+    if spec.device not in method.devices:
+        known = ", ".join(method.devices)
+        raise SplashbenchError(f"study {spec.name}: method {method.id} runs on {known}, not on {spec.device!r}")
+    preset = spec.preset or next(iter(method.Config.presets))
+    scenes = _open_scenes(spec)
+    timing = TIMING_FRAMES if "render_fps" in spec.metrics else 0
+    references: dict[str, Planned] = {}
+    runs: list[Planned] = []
+    settings = {v.name: _checked(spec, method, v.name, v.preset or preset, v.settings) for v in spec.variants}
+    for seed in spec.seeds:
+        for scene in scenes:
+            for variant in spec.variants:
+                reference = _reference(spec, scene, variant, seed, timing)
+                if reference:
+                    references.setdefault(reference.digest, reference)
+                overrides, resolved = settings[variant.name]
+                chosen = variant.preset or preset
+                runs.append(
+                    Planned(
+                        scene,
+                        variant,
+                        seed,
+                        _digest(method, chosen, resolved, seed, spec.device, scene.scene, variant),
+                        spec.method,
+                        chosen,
+                        overrides,
+                        reference.digest if reference else None,
+                        timing,
+                    )
+                )
+    return Plan(spec, method, preset, scenes, tuple(references.values()), tuple(runs))
+
+
+def _open_scenes(spec: StudySpec) -> tuple[Named, ...]:
+    scenes: list[Named] = []
+    for entry in spec.scenes:
+        scene = Scene.open(Path(entry.path))
+        name = entry.name or scene.name
+        if name in [other.name for other in scenes]:
+            raise SplashbenchError(f"study {spec.name}: two scenes are called {name!r}; give one another name")
+        scenes.append(Named(name, scene))
+    return tuple(scenes)
+
+
+def _checked(
+    spec: StudySpec, method: Method, row: str, preset: str, settings: Mapping[str, Any], *, with_base: bool = True
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The overrides of a row, and all its settings; an unknown one is told by row."""
+    overrides = {**(spec.base if with_base else {}), **settings}
+    try:
+        config = method.Config.preset(preset, overrides)
+    except SplashbenchError as error:
+        raise SplashbenchError(f"study {spec.name}, variant {row}: {error}") from None
+    return overrides, without_nulls(config.model_dump(mode="json"))
+
+
+def _reference(spec: StudySpec, scene: Named, variant: Variant, seed: int, timing: int) -> Planned | None:
+    if spec.reference is None:
+        return None
+    wanted = spec.reference
+    method = load_method(wanted.method)
+    preset = wanted.preset or next(iter(method.Config.presets))
+    overrides, resolved = _checked(spec, method, wanted.method, preset, wanted.settings, with_base=False)
+    changed = changes(scene.scene, variant, seed) is not None
+    row = Variant(
+        name=wanted.method,
+        perturbation=variant.perturbation if changed else (),
+        train_views=variant.train_views if changed else None,
+    )
+    digest = _digest(method, preset, resolved, seed, "cpu", scene.scene, row)
+    return Planned(scene, row, seed, digest, wanted.method, preset, overrides, None, timing)
+
+
+def _digest(
+    method: Method, preset: str, settings: Mapping[str, Any], seed: int, device: str, scene: Scene, variant: Variant
+) -> str:
+    said = {
+        "method": [method.id, method.version],
+        "preset": preset,
+        "settings": settings,
+        "seed": seed,
+        "device": device,
+        "scene": [scene.digest, changes(scene, variant, seed)],
+        "protocol": PROTOCOL_V1.digest,
+    }
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

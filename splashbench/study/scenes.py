@@ -1,0 +1,118 @@
+"""The scene a run is made on: the scene itself, or a copy with worse training masks or fewer training views.
+
+A copy shares every file with its scene that does not differ (hard links where the disk allows them); test views are
+always the scene's own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splashbench.adapter.reuse import alone
+from splashbench.errors import SplashbenchError
+from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
+from splashbench.scene import Scene
+from splashbench.study.perturb import Perturbation, direction_of_loss, without_part
+from splashbench.study.spec import Variant
+from splashbench.study.views import nested_views
+
+#: Raised when a change alters the copies that the same description gives.
+_VERSION = 1
+
+
+def changes(scene: Scene, variant: Variant, seed: int) -> dict[str, Any] | None:
+    """How the scene of `variant`'s run differs from `scene`, in JSON's terms; None where it does not.
+
+    Raises SplashbenchError where the scene cannot be changed so.
+    """
+    said: dict[str, Any] = {}
+    if variant.train_views is not None:
+        views = variant.train_views
+        kept = nested_views(scene, views) if isinstance(views, int) else _named_views(scene, views)
+        if kept != scene.train:
+            said["train_views"] = list(kept)
+    if variant.perturbation:
+        said |= {"masks": [step.model_dump() for step in variant.perturbation], "seed": seed}
+    return said | {"version": _VERSION} if said else None
+
+
+def _named_views(scene: Scene, names: tuple[str, ...]) -> tuple[str, ...]:
+    for name in names:
+        if name not in scene.train:
+            raise SplashbenchError(f"{scene.directory} has no training view {name!r}; it has {', '.join(scene.train)}")
+    if len(set(names)) < 2:
+        raise SplashbenchError(f"{scene.directory}: train_views keeps {len(set(names))} view; keep two or more")
+    return tuple(name for name in scene.train if name in names)
+
+
+def changed_scene(scene: Scene, variant: Variant, seed: int, cache: Path) -> Scene:
+    """`scene` as `variant` has it: itself, or its copy in the folder `cache`, made there where it is not yet."""
+    said = changes(scene, variant, seed)
+    if said is None:
+        return scene
+    text = json.dumps([scene.digest, said], sort_keys=True)
+    # The folder keeps its name: without scene.json it decides what a scene is (Table S1).
+    place = cache / hashlib.sha256(text.encode()).hexdigest()[:16] / scene.directory.resolve().name
+    with alone(place.parent.with_suffix(".lock")):
+        if not place.exists():
+            with atomic_directory(place) as staging:
+                _copy(scene, said.get("train_views", list(scene.train)), staging)
+                if variant.perturbation:
+                    _perturb_masks(Scene.open(staging), scene, variant.perturbation, seed)
+    return Scene.open(place)
+
+
+def _copy(scene: Scene, train: list[str], directory: Path) -> None:
+    """A copy of `scene` with the training views `train` only."""
+    kept = [*train, *scene.test]
+    gone = set(scene.cameras) - set(kept)
+    for root, folders, names in os.walk(scene.directory):
+        folders.sort()
+        for name in names:
+            path = Path(root, name).relative_to(scene.directory)
+            if path.parts[0] in ("ims", "seg", "container_mask") and Path(path.parts[1]).stem in gone:
+                continue
+            _link(scene.directory / path, directory / path)
+    columns = [scene.train.index(name) for name in train]
+    meta = read_json(scene.directory / "train_meta.json")
+    for key in ("k", "w2c", "fn"):
+        meta[key] = [[row[column] for column in columns] for row in meta[key]]
+    # Written as new files: the links go, and with them the way back to the scene's own.
+    write_json(directory / "train_meta.json", meta)
+    if scene.meta is not None:
+        subsets = {
+            key: {name: value for name, value in known.items() if name in kept}
+            for key in ("sizes", "camera_times")
+            if (known := getattr(scene.meta, key)) is not None
+        }
+        write_model(directory / "scene.json", scene.meta.model_copy(update=subsets))
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source.resolve(), target)
+    except OSError:  # another disk, or one without links
+        shutil.copyfile(source, target)
+
+
+def _perturb_masks(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], seed: int) -> None:
+    """Replace the training masks of `copy` by worse ones; the same seed gives the same masks."""
+    wet = np.array([[scene.mask(name, t).any() for t in range(scene.n_frames)] for name in copy.train])
+    rng = np.random.default_rng([seed, *hashlib.sha256(scene.name.encode()).digest()[:8]])
+    kept = np.ones(wet.shape)
+    for step in steps:
+        kept *= step.draw()(wet, rng)
+    for c, name in enumerate(copy.train):
+        direction = direction_of_loss(rng)
+        for t in range(scene.n_frames):
+            if kept[c, t] < 1:
+                left = without_part(scene.mask(name, t), kept[c, t], direction)
+                write_png(copy.mask_path(name, t), np.where(left, 255, 0).astype(np.uint8))

@@ -1,0 +1,206 @@
+"""Containers: their depth, their walls, and carving around what they hide. The answers are known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from splashbench.observe import Bounds, ContainerShadow, Grid, Silhouettes, sequence_bounds, signed_distance_fields
+from splashbench.observe.container import depth_image, hidden, solid_distance
+from splashbench.observe.shadow import CarvingContainer
+from splashbench.scene import Camera, ContainerMesh
+
+RADIUS = 0.25
+
+
+def mesh_of(shape: trimesh.Trimesh) -> ContainerMesh:
+    return ContainerMesh(shape.vertices, shape.faces)
+
+
+def box(low: tuple, high: tuple) -> ContainerMesh:
+    return mesh_of(trimesh.creation.box(bounds=(low, high)))
+
+
+def nodes(grid: Grid) -> np.ndarray:
+    return grid.to_scene(np.moveaxis(np.indices(grid.shape), 0, -1))
+
+
+def camera_at(name: str, eye: np.ndarray) -> Camera:
+    """A 240x200 camera at `eye` that looks at the origin with y up."""
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ eye
+    return Camera(name, 240, 200, np.array([[400.0, 0, 120], [0, 400, 100], [0, 0, 1]]), w2c)
+
+
+class BallBehindAWall:
+    """A ball of radius 0.25 about the origin and five cameras; a wall hides its lower half from the three on +x."""
+
+    name = "ball_behind_a_wall"
+    n_frames = 1
+    WALL = ((0.5, -1.0, -1.0), (0.55, 0.0, 1.0))
+
+    def __init__(self) -> None:
+        eyes = [(2.5, 0.3, -0.9), (2.6, 0.5, 0.0), (2.5, 0.3, 0.9), (0.3, 1.6, -2.0), (0.0, 0.4, 2.5)]
+        self.cameras = {str(i): camera_at(str(i), np.array(eye)) for i, eye in enumerate(eyes)}
+        self.train = tuple(self.cameras)
+
+    def mask(self, camera: str, t: int) -> np.ndarray:
+        """Exact: a pixel is liquid where the ray through its centre meets the ball, and the wall not before it."""
+        view = self.cameras[camera]
+        rows, columns = np.mgrid[: view.height, : view.width] + 0.5
+        rays = np.stack([(columns - 120) / 400, (rows - 100) / 400, np.ones_like(rows)], axis=-1) @ view.w2c[:3, :3]
+        low, high = ((np.array(corner) - view.center) / rays for corner in self.WALL)
+        enter, leave = np.minimum(low, high).max(axis=-1), np.maximum(low, high).min(axis=-1)
+        square, middle = (rays**2).sum(axis=-1), rays @ view.center
+        root = middle**2 - square * (view.center @ view.center - RADIUS**2)
+        to_ball = (-middle - np.sqrt(np.maximum(root, 0))) / square
+        return (root > 0) & ((leave < enter) | (enter > to_ball))
+
+
+@pytest.fixture(scope="module")
+def wall() -> ContainerShadow:
+    return ContainerShadow(box(*BallBehindAWall.WALL))
+
+
+def test_the_depth_of_a_plane_is_exact_in_every_pixel() -> None:
+    camera = camera_at("a", np.array([0.5, 1.0, -3.0]))
+    depth = depth_image(box((-9, -9, 0), (9, 9, 9)), camera)  # its front face is the plane z = 0
+    rows, columns = np.mgrid[:200, :240] + 0.5
+    rays = np.stack([(columns - 120) / 400, (rows - 100) / 400, np.ones_like(rows)], axis=-1) @ camera.w2c[:3, :3]
+    np.testing.assert_allclose(depth, 3.0 / rays[..., 2], rtol=1e-6)
+
+
+def test_a_mesh_around_the_camera_is_cut_at_the_near_plane_and_seen_from_inside() -> None:
+    camera = camera_at("a", np.array([0.0, 0.0, -3.0]))
+    depth = depth_image(box((-9, -9, -9), (9, 9, 4)), camera)
+    np.testing.assert_allclose(depth, 7.0, rtol=1e-6)
+    behind = depth_image(box((-1, -1, -9), (1, 1, -5)), camera)
+    assert behind.shape == (200, 240)
+    assert np.isinf(behind).all()
+
+
+def test_the_distance_to_a_box_is_that_of_its_formula() -> None:
+    low, high = np.array([-0.5, -0.3, -0.2]), np.array([0.5, 0.3, 0.2])
+    grid = Grid.over(Bounds(np.full(3, -1.0), np.full(3, 1.0)), 50)
+    distance = solid_distance(box(tuple(low), tuple(high)), grid)
+    beyond = np.abs(nodes(grid)) - high
+    true = np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(axis=-1), 0)
+    true = np.clip(true / grid.voxel, -20, 20)
+    assert distance.dtype == np.float32
+    near = np.abs(true) < 3.99
+    np.testing.assert_allclose(distance[near], true[near], atol=1e-4)
+    np.testing.assert_allclose(distance, true, atol=2)
+    assert np.abs(distance - true).mean() < 0.2
+
+
+def test_the_space_inside_a_bowl_is_free_and_its_wall_is_not() -> None:
+    inner, outer = trimesh.creation.icosphere(4, 0.8), trimesh.creation.icosphere(4, 1.0)
+    shell = trimesh.util.concatenate([outer, trimesh.Trimesh(inner.vertices, inner.faces[:, ::-1])])
+    grid = Grid.over(Bounds(np.full(3, -1.2), np.full(3, 1.2)), 48)
+    radius = np.linalg.norm(nodes(grid), axis=-1)
+    clear = np.minimum(np.abs(radius - 0.8), np.abs(radius - 1.0)) > 0.01  # the spheres are polyhedra
+    walls = solid_distance(mesh_of(shell), grid) < 0
+    np.testing.assert_array_equal(walls[clear], ((radius > 0.8) & (radius < 1.0))[clear])
+    # Whichever way the faces are turned.
+    odd = np.arange(len(shell.faces))[:, None] % 2
+    turned = ContainerMesh(shell.vertices, np.where(odd, shell.faces, shell.faces[:, ::-1]))
+    np.testing.assert_array_equal((solid_distance(turned, grid) < 0)[clear], walls[clear])
+
+
+def test_parts_that_overlap_are_solid_where_they_do() -> None:
+    sizes = [((-0.7, -0.3, -0.3), (0.3, 0.3, 0.3)), ((-0.2, -0.2, -0.2), (0.8, 0.2, 0.2))]
+    two = trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in sizes])
+    grid = Grid.over(Bounds(np.full(3, -1.0), np.full(3, 1.0)), 20)
+    distance = solid_distance(mesh_of(two), grid)
+    assert distance[10, 10, 10] < 0
+    assert distance[1, 1, 1] > 0
+
+
+def test_an_open_mesh_has_no_inside() -> None:
+    shape = trimesh.creation.box()
+    grid = Grid.over(Bounds(np.full(3, -1.0), np.full(3, 1.0)), 16)
+    assert (solid_distance(ContainerMesh(shape.vertices, shape.faces[1:]), grid) >= 0).all()
+
+
+def test_points_behind_the_wall_are_hidden(wall: ContainerShadow) -> None:
+    camera = BallBehindAWall().cameras["1"]
+    depth = depth_image(wall.mesh, camera)
+    points = np.array([[0, -0.2, 0], [0, 0.2, 0], [0.7, -0.2, 0], [0.5, -0.2, 0], [0, -9, 0], [5.0, 0, 0]])
+    assert hidden(points, depth, camera, 0.06).tolist() == [True, False, False, False, False, False]
+
+
+def recall_and_excess(scene: BallBehindAWall, container: ContainerShadow | None) -> tuple[float, float]:
+    """Share of the ball that the hull holds, and volume of the hull beside the ball in volumes of the ball."""
+    fields = signed_distance_fields(scene, 48, container=container)
+    grid = Grid.over(Bounds(np.full(3, -0.4), np.full(3, 0.4)), 60)
+    points = nodes(grid).reshape(-1, 3)
+    inside = np.linalg.norm(points, axis=-1) < RADIUS
+    liquid = fields.sample(0, points) < 0
+    return liquid[inside].mean(), (liquid & ~inside).sum() / inside.sum()
+
+
+def test_what_the_wall_hides_is_not_carved_away(wall: ContainerShadow) -> None:
+    scene = BallBehindAWall()
+    blind, _ = recall_and_excess(scene, None)
+    aware, excess = recall_and_excess(scene, wall)
+    assert blind < 0.75
+    assert aware > 0.98
+    assert excess < 0.6  # the two views that see the lower half bound it from two sides only
+    # Through glass every view sees the ball, so its masks would be evidence again.
+    glass, _ = recall_and_excess(scene, ContainerShadow(wall.mesh, hides=False))
+    assert glass == pytest.approx(blind, abs=0.02)
+
+
+def test_phi_runs_smoothly_over_the_edge_of_the_shadow(wall: ContainerShadow) -> None:
+    fields = signed_distance_fields(BallBehindAWall(), 64, container=wall)
+    inside = np.linalg.norm(nodes(fields.grid), axis=-1) < 0.6 * RADIUS
+    phi = fields.phi[0]
+    # Without the union the rim of the wall, as each view sees it, would be a surface through the ball's middle.
+    assert phi[inside].max() < -0.2 * RADIUS / fields.voxel
+
+
+def test_nothing_is_liquid_in_a_wall_or_below_the_foot() -> None:
+    scene = BallBehindAWall()
+    plate = ContainerShadow(box((-1, -0.1, -1), (1, 0.0, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
+    fields = signed_distance_fields(scene, 48, container=plate)
+    y = nodes(fields.grid)[..., 1]
+    assert (fields.phi[0][y < -1e-6] > 0).all()
+    assert (fields.phi[0] < 0).any()
+    floor = ContainerShadow(box((-1, 0.1, -1), (1, 0.2, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
+    assert sequence_bounds(scene, floor).low[1] == pytest.approx(0.1, abs=0.01)
+
+
+def test_two_views_must_see_a_point() -> None:
+    scene = BallBehindAWall()
+    grid = Grid.over(Bounds(np.full(3, -0.3), np.full(3, 0.3)), 24)
+
+    def seen(*walls: tuple) -> bool:
+        shape = trimesh.util.concatenate([trimesh.creation.box(bounds=wall) for wall in walls])
+        outside = CarvingContainer(ContainerShadow(mesh_of(shape)), Silhouettes(scene), grid).outside
+        assert (outside > 0).all() or (outside < 0).all()
+        return bool((outside < 0).all())
+
+    right, front = ((0.5, -2, -2), (0.55, 2, 2)), ((-2, -2, -0.55), (2, 2, -0.5))
+    assert seen(right)  # from cameras 3 and 4
+    assert not seen(right, front)  # from camera 4 alone
+
+
+def test_carving_around_a_container_does_not_depend_on_threads(wall: ContainerShadow, monkeypatch) -> None:
+    from splashbench import parallel
+
+    shared = signed_distance_fields(BallBehindAWall(), 40, container=wall)
+    monkeypatch.setattr(parallel, "thread_count", lambda: 1)
+    np.testing.assert_array_equal(signed_distance_fields(BallBehindAWall(), 40, container=wall).phi, shared.phi)
+
+
+def test_a_container_out_of_sight_changes_nothing() -> None:
+    far = ContainerShadow(box((50, 50, 50), (51, 51, 51)))
+    scene = BallBehindAWall()
+    np.testing.assert_array_equal(
+        signed_distance_fields(scene, 24, container=far).phi, signed_distance_fields(scene, 24).phi
+    )

@@ -1,0 +1,173 @@
+"""Masks that are empty, full, cut or of another time: the hull must stay right, or one line must say why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splashbench.errors import SplashbenchError
+from splashbench.observe import Silhouettes, distrust_failed_masks, sequence_bounds, signed_distance_fields
+from splashbench.observe.failures import missing_shares
+from splashbench.observe.silhouettes import blended, signed_distance_2d
+from splashbench.scene import Camera
+
+FOCAL, WIDTH, HEIGHT = 260.0, 160, 120
+
+
+def camera_at(name: str, angle: float) -> Camera:
+    eye = np.array([2.5 * np.cos(angle), 0.8, 2.5 * np.sin(angle)])
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ eye
+    return Camera(name, WIDTH, HEIGHT, np.array([[FOCAL, 0, 80], [0, FOCAL, 60], [0, 0, 1]]), w2c)
+
+
+class MovingBall:
+    """A ball of radius 0.2 that crosses the view along z within `n_frames` seconds, from `views` cameras on an arc."""
+
+    name = "moving_ball"
+    SPEED = 0.08
+
+    def __init__(self, views: int = 5, n_frames: int = 9) -> None:
+        self.cameras = {str(i): camera_at(str(i), angle) for i, angle in enumerate(np.linspace(-0.7, 0.7, views))}
+        self.train = tuple(self.cameras)
+        self.n_frames = n_frames
+        self.times = np.arange(n_frames, dtype=float)
+        self.camera_times = dict.fromkeys(self.train, self.times)
+        self.changed: dict[tuple[str, int], str] = {}
+
+    def centre(self, time: float) -> np.ndarray:
+        return np.array([0.0, 0.0, self.SPEED * (time - (self.n_frames - 1) / 2)])
+
+    def mask(self, camera: str, t: int) -> np.ndarray:
+        view = self.cameras[camera]
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        rays = np.stack([(columns - 80) / FOCAL, (rows - 60) / FOCAL, np.ones_like(rows)], axis=-1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        centre = view.w2c[:3, :3] @ self.centre(self.camera_times[camera][t]) + view.w2c[:3, 3]
+        mask = centre @ centre - (rays @ centre) ** 2 < 0.2**2
+        change = self.changed.get((camera, t), "")
+        if change == "empty":
+            mask[:] = False
+        elif change == "full":
+            mask[:] = True
+        elif change == "cut":
+            mask[int(np.quantile(np.nonzero(mask)[0], 0.6)) :] = False
+        return mask
+
+
+def inside(scene: MovingBall, fields, t: int) -> float:
+    """Share of the ball that the hull of frame `t` holds."""
+    grid = np.moveaxis(np.indices((21, 21, 21)), 0, -1).reshape(-1, 3) / 10 - 1.0
+    ball = grid[np.linalg.norm(grid, axis=1) < 0.95] * 0.2 + scene.centre(scene.times[t])
+    return float((fields.sample(t, ball) < 0).mean())
+
+
+def test_a_cut_mask_is_found_and_replaced_and_no_other() -> None:
+    scene = MovingBall()
+    clean = Silhouettes(scene)
+    assert not distrust_failed_masks(clean).any()
+    scene.changed = {("1", 4): "cut", ("3", 6): "cut"}
+    silhouettes = Silhouettes(scene)
+    found = distrust_failed_masks(silhouettes)
+    assert sorted(map(tuple, np.argwhere(found).tolist())) == [(4, 1), (6, 3)]
+    assert silhouettes.failed(4) == ["1"]
+    assert (missing_shares(Silhouettes(scene))[[4, 6], [1, 3]] > 0.2).all()
+    # The frames before and after stand in, and the ball is whole again.
+    replaced = silhouettes.evidence_mask(1, 4)
+    whole = clean.mask(1, 4)
+    assert replaced[whole].mean() > 0.97
+    assert replaced.sum() < 1.6 * whole.sum()
+
+
+def test_a_cut_mask_costs_liquid_only_until_it_is_found() -> None:
+    scene = MovingBall()
+    scene.changed = {("1", 4): "cut"}
+    cut = signed_distance_fields(scene, 40)
+    assert inside(scene, cut, 4) < 0.75
+    mended = signed_distance_fields(scene, 40, find_failures=True)
+    assert inside(scene, mended, 4) > 0.99
+
+
+def test_a_camera_that_never_sees_liquid_takes_nothing_away() -> None:
+    scene = MovingBall()
+    scene.changed = {("2", t): "empty" for t in range(scene.n_frames)}
+    assert inside(scene, signed_distance_fields(scene, 32, find_failures=True), 4) > 0.99
+
+
+def test_frames_without_liquid_stay_empty_between_others() -> None:
+    scene = MovingBall()
+    scene.changed = {(view, t): "empty" for view in scene.train for t in (0, 1, 5)}
+    fields = signed_distance_fields(scene, 24, find_failures=True)
+    assert [(phi < 0).any() for phi in fields.phi] == [False, False, True, True, True, False, True, True, True]
+
+
+def test_no_liquid_at_all_is_one_line() -> None:
+    scene = MovingBall(n_frames=2)
+    scene.changed = {(view, t): "empty" for view in scene.train for t in range(2)}
+    with pytest.raises(SplashbenchError, match="moving_ball: fewer than 2 training views have any liquid"):
+        Silhouettes(scene)
+
+
+def test_full_masks_everywhere_are_one_line_and_in_one_view_no_matter() -> None:
+    scene = MovingBall(n_frames=3)
+    scene.changed = {("0", t): "full" for t in range(3)}
+    assert inside(scene, signed_distance_fields(scene, 24, find_failures=True), 1) > 0.99
+    scene.changed = {(view, t): "full" for view in scene.train for t in range(3)}
+    with pytest.raises(SplashbenchError, match="moving_ball: every liquid mask of the training views is full"):
+        Silhouettes(scene)
+
+
+def test_two_views_make_a_hull() -> None:
+    scene = MovingBall(views=2)
+    fields = signed_distance_fields(scene, 32, find_failures=True)
+    assert min(inside(scene, fields, t) for t in range(scene.n_frames)) > 0.99
+
+
+def test_cameras_that_look_elsewhere_are_one_line() -> None:
+    scene = MovingBall()
+    silhouettes = Silhouettes(scene)
+    back_to_front = np.diag([-1.0, 1, -1, 1])
+    for number in (1, 3):
+        camera = silhouettes.cameras[number]
+        silhouettes.cameras[number] = Camera(camera.name, WIDTH, HEIGHT, camera.K, back_to_front @ camera.w2c)
+    with pytest.raises(SplashbenchError, match="no common visual hull"):
+        sequence_bounds(silhouettes)
+
+
+def test_a_camera_on_a_clock_of_its_own_is_carved_with_at_the_scenes_times() -> None:
+    scene = MovingBall()
+    for i, view in enumerate(scene.train):
+        scene.camera_times[view] = scene.times + (-0.3, 0.0, 0.3, 0.2, -0.2)[i]
+    blind, aware = Silhouettes(scene, interpolate_times=False), Silhouettes(scene)
+    exact = Silhouettes(MovingBall())
+    for view in (0, 2):
+        window = exact.windows[view].joined(blind.windows[view])
+        true = exact.distance(view, 4, window)
+        near = np.abs(true) < 3
+        errors = [np.abs(one.distance(view, 4, window) - true)[near].mean() for one in (blind, aware)]
+        assert errors[1] < 0.3 * errors[0]
+    scene.camera_times = dict.fromkeys(scene.train, scene.times + 0.005)  # half a percent of a step
+    np.testing.assert_array_equal(
+        Silhouettes(scene).distance(0, 4), Silhouettes(scene, interpolate_times=False).distance(0, 4)
+    )
+
+
+def test_a_drop_that_moves_by_more_than_its_size_does_not_vanish_between_frames() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    first, second = ((rows - 30) ** 2 + (columns - column) ** 2 < 16 for column in (20, 40))
+    pool = rows > 50
+    between = blended(signed_distance_2d(first | pool), signed_distance_2d(second | pool), 0.3)
+    assert (between[first] < 0).mean() > 0.99
+    assert (between[pool] < 0).all()
+
+
+def test_masks_are_kept_as_bits() -> None:
+    scene = MovingBall()
+    scene.changed = {("0", 0): "full"}
+    silhouettes = Silhouettes(scene)
+    assert silhouettes.nbytes < scene.n_frames * 5 * WIDTH * HEIGHT / 8 + 1000
+    np.testing.assert_array_equal(silhouettes.mask(0, 3), scene.mask("0", 3))

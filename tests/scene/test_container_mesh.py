@@ -1,0 +1,126 @@
+"""Container meshes: PLY, GLB and OBJ files, where they lie, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from splashbench.adapter.training_view import make_training_view
+from splashbench.errors import SplashbenchError
+from splashbench.scene import ContainerMesh, Scene
+from splashbench.scene.container import read_mesh
+from splashbench.synth.geometry import bowl_mesh
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+)
+
+
+def with_mesh(directory: Path, name: str, pose: list | None = None) -> Path:
+    """Name a container mesh in the scene.json of `directory`."""
+    path = directory / "scene.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"container_mesh": name, "container_pose": pose}))
+    return directory
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_a_ply_file_is_read_as_it_was_written(tmp_path: Path, form: str) -> None:
+    box = trimesh.creation.box(extents=(1, 2, 3))
+    (tmp_path / "box.ply").write_bytes(trimesh.exchange.ply.export_ply(box, encoding=form))
+    mesh = read_mesh(tmp_path / "box.ply")
+    assert mesh.faces.shape == (12, 3)
+    np.testing.assert_allclose(mesh.vertices.max(axis=0), [0.5, 1, 1.5])
+    assert mesh.is_closed
+    assert mesh.is_oriented
+
+
+def test_every_part_of_a_glb_file_lies_where_its_scene_puts_it(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([5, 0, 0]))
+    scene.add_geometry(trimesh.creation.box())
+    (tmp_path / "boxes.glb").write_bytes(scene.export(file_type="glb"))
+    mesh = read_mesh(tmp_path / "boxes.glb")
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], [[-0.5] * 3, [5.5, 0.5, 0.5]])
+    assert mesh.is_closed
+
+
+def test_an_obj_file_opens_no_other_file(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("mtllib /etc/passwd\nusemtl x\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert len(read_mesh(tmp_path / "a.obj").faces) == 1
+
+
+def test_vertices_that_a_seam_has_split_are_one_again() -> None:
+    box = trimesh.creation.box()
+    mesh = ContainerMesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    assert mesh.vertices.shape == (8, 3)
+    assert mesh.is_closed
+    assert not ContainerMesh(box.vertices, box.faces[:-1]).is_closed
+    turned = box.faces.copy()
+    turned[0] = turned[0, ::-1]
+    assert ContainerMesh(box.vertices, turned).is_closed
+    assert not ContainerMesh(box.vertices, turned).is_oriented
+
+
+@pytest.mark.parametrize(
+    ("body", "fault"),
+    [
+        (PLY + "0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n", "not finite"),
+        (PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "vertices which are not there"),
+        (PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 -1\n", "vertices which are not there"),
+        (PLY + "0 0 0\n1 0 0\n0 0 0\n3 0 1 2\n", "no triangle"),
+        ("something else", "not a readable mesh"),
+    ],
+)
+def test_a_damaged_mesh_is_one_line_that_names_the_file(tmp_path: Path, body: str, fault: str) -> None:
+    path = tmp_path / "bad.ply"
+    path.write_text(body)
+    with pytest.raises(SplashbenchError, match=fault) as caught:
+        read_mesh(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_mesh_shown_a_million_times_is_refused_before_it_is_written_out(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("splashbench.scene.container.MAX_FACES", 100)
+    scene = trimesh.Scene()
+    box = trimesh.creation.box()
+    for n in range(10):
+        scene.add_geometry(box, node_name=str(n), geom_name="box")
+    (tmp_path / "many.glb").write_bytes(scene.export(file_type="glb"))
+    with pytest.raises(SplashbenchError, match="120 faces, more than 100"):
+        read_mesh(tmp_path / "many.glb")
+
+
+def test_a_scene_places_its_mesh_and_a_method_sees_it(balls_copy: Path, tmp_path: Path) -> None:
+    assert Scene.open(balls_copy).container_mesh() is None
+    bowl = bowl_mesh()
+    (balls_copy / "truth" / "bowl.ply").write_bytes(
+        trimesh.exchange.ply.export_ply(trimesh.Trimesh(bowl.vertices, bowl.faces, process=False))
+    )
+    pose = np.diag([2.0, 2, 2, 1])
+    pose[:3, 3] = 1, 2, 3
+    scene = Scene.open(with_mesh(balls_copy, "truth/bowl.ply", pose.tolist()))
+    mesh = scene.container_mesh()
+    assert mesh is not None
+    np.testing.assert_allclose(mesh.vertices.max(axis=0), 2 * bowl.vertices.max(axis=0) + [1, 2, 3], rtol=1e-5)
+    shown = make_training_view(scene, tmp_path / "view")
+    assert not (shown / "truth").exists()
+    seen = Scene.open(shown).training().container_mesh()
+    assert seen is not None
+    np.testing.assert_array_equal(seen.vertices, mesh.vertices)
+
+
+@pytest.mark.parametrize("name", ["../outside.ply", "/etc/outside.ply", "a/../../outside.ply", "mesh.stl", ""])
+def test_a_mesh_outside_the_scene_or_of_another_kind_is_refused(balls_copy: Path, name: str) -> None:
+    with pytest.raises(SplashbenchError, match=r"scene\.json: container_mesh"):
+        Scene.open(with_mesh(balls_copy, name)).container_mesh()
+
+
+def test_a_missing_mesh_is_named(balls_copy: Path) -> None:
+    with pytest.raises(SplashbenchError, match=r"gone\.ply does not exist"):
+        Scene.open(with_mesh(balls_copy, "gone.ply")).container_mesh()

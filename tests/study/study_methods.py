@@ -1,0 +1,73 @@
+"""Methods for the tests of studies: fits of no time whose figures follow from settings and seed."""
+
+import json
+import os
+import time as clock
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.scene import Camera, Particles, TrainingScene
+
+
+class Settings(MethodConfig):
+    presets: ClassVar[dict] = {"best": {}, "dark": {"grey": 0.1}}
+    grey: float = 0.5
+    #: grey levels per seed
+    wobble: float = 0.0
+    fail_on_seed: int | None = None
+    #: seconds that the shared part takes
+    shared_seconds: float = 0.0
+    #: a file in which every fit leaves a line
+    log: str = ""
+
+
+class Grey(Method):
+    """One grey; a level of its own for each seed."""
+
+    id, title, version, Config = "grey", "one grey", "3", Settings
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Fitted:
+        if config.log:
+            with Path(config.log).open("a", encoding="utf-8") as stream:
+                stream.write(f"{config.grey} {run.seed}\n")
+        if config.fail_on_seed == run.seed:
+            raise RuntimeError("this seed does not work")
+
+        def fit() -> float:
+            clock.sleep(config.shared_seconds)
+            return float(os.getpid())
+
+        key = {"shared_seconds": config.shared_seconds}
+        shared = run.reuse("part", scene, key, fit, _save, lambda directory: float((directory / "pid").read_text()))
+        covered = sum(int(scene.mask(name, t).sum()) for name in scene.train for t in range(scene.n_frames))
+        return Model(config.grey + config.wobble * run.seed, scene.n_frames, shared, covered)
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        said = json.loads((directory / "model.json").read_text())
+        return Model(said["grey"], scene.n_frames, said["shared"], said["covered"])
+
+
+def _save(value: float, directory: Path) -> None:
+    (directory / "pid").write_text(str(value))
+
+
+class Model(Fitted):
+    """`covered`: pixels of liquid seen in training, which gives the number of particles."""
+
+    def __init__(self, grey: float, n_frames: int, shared: float, covered: int) -> None:
+        self.grey, self.n_frames, self.shared, self.covered = grey, n_frames, shared, covered
+
+    def render(self, camera: Camera, time: float) -> Render:
+        size = (camera.height, camera.width)
+        return Render(np.full((*size, 3), self.grey, np.float32), np.ones(size, np.float32))
+
+    def particles(self) -> Particles:
+        count = max(1, self.covered // 100)
+        return Particles(np.zeros((self.n_frames, count, 3)), np.ones((self.n_frames, count), bool))
+
+    def save(self, directory: Path) -> None:
+        said = {"grey": self.grey, "shared": self.shared, "covered": self.covered}
+        (directory / "model.json").write_text(json.dumps(said))
