@@ -8,11 +8,14 @@ do not depend on the number of threads. A kernel must not start others: they wou
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+Value = TypeVar("Value")
 
 # More parts than threads, because the work along an axis of a grid is uneven.
 _PARTS_PER_THREAD = 4
@@ -52,6 +55,13 @@ def over_range(kernel: Callable[..., None], count: int, *arguments: Any, smalles
     futures = [_pool().submit(kernel, *arguments, start, stop) for start, stop in pairwise(edges)]
     for future in futures:
         future.result()
+
+
+def each(function: Callable[[Item], Value], items: Iterable[Item]) -> list[Value]:
+    """[function(item) for item in items], on all threads; for functions that release the GIL most of their time."""
+    if thread_count() == 1:
+        return [function(item) for item in items]
+    return list(_pool().map(function, items))
 
 
 def on_all_threads(kernel: Callable[[int, int], None]) -> None:

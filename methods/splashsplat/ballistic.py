@@ -1,9 +1,9 @@
 """The jet: liquid in the air falls freely, and gravity is known.
 
 The hull's surface says little of how fast a steady stream runs through it: nothing visible moves. Its shape does. In
-free fall the path of a steady jet bends by g / (2 v_h^2) and its cross-section thins as 1 / speed, and its first drop
-and its last fall as any stone does. One vertical speed w at one height explains all of these; it is found by trying
-speeds, the horizontal motion following linearly. Not in the paper, which fits all motion by level sets.
+free fall the path of a steady jet bends by g / (2 v_h^2), its level cross-section thins as 1 / vertical speed, and its
+first drop and its last fall as any stone does. One vertical speed w at one height explains all of these; it is found by
+trying speeds, the horizontal motion following linearly. Not in the paper, which fits all motion by level sets.
 
 Coordinates are upright (pool.py): horizontal two, then height. Scene units and seconds.
 """
@@ -17,9 +17,9 @@ import numpy as np
 
 from splashbench.scene.camera import Camera
 
-# What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, and of the
-# height of a tip or tail (voxels).
-_MIDDLE, _AREA, _END = 0.1, 0.2, 2.0
+# What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, of its radius
+# (voxels), and of the height of a tip or tail (voxels).
+_MIDDLE, _AREA, _RADIUS, _END = 0.1, 0.2, 0.5, 2.0
 # Neighbouring slices err alike: so many of them count as one.
 _ALIKE = 4
 _SLICES_AT_LEAST = 8
@@ -148,6 +148,8 @@ def fit_jets(frames: list[Slices], times: np.ndarray, gravity: float, voxel: flo
     speeds = np.geomspace(fastest / 300, fastest, _SPEEDS)
     tried = (_explained(streams, ends, float(speed), top, gravity, voxel) for speed in speeds)
     _, speed, paths = min(tried, key=lambda explained: explained[0])
+    if speed in (speeds[0], speeds[-1]):  # nothing bends, thins or falls: any speed will do
+        return [None] * len(frames)
     found = {number: path for number, path in zip(used, paths) if path is not None}
     jets: list[Jet | None] = []
     for t in range(len(frames)):
@@ -185,13 +187,16 @@ def _explained(
         design = np.stack([np.ones_like(tau), tau], axis=1)
         path = _robust(design, group.middle, _MIDDLE * voxel)
         error = np.linalg.norm(group.middle - design @ path, axis=1) / (_MIDDLE * voxel)
-        flow = np.sqrt((speed + gravity * tau) ** 2 + (path[1] ** 2).sum())
-        thinning = np.log(group.area * flow)
-        spread = np.abs(thinning - np.median(thinning)) / _AREA
+        # Slices are level: what passes through one is its area times the vertical speed.
+        thinning = np.log(group.area * (speed + gravity * tau))
+        # A hull's radius is uncertain by a pixel or so, which means more in a thin jet.
+        doubt = np.hypot(_AREA, 2 * _RADIUS * voxel / np.sqrt(group.area / np.pi))
+        unlike = np.abs(thinning - np.median(thinning))
+        spread = unlike / doubt
         cost += float((np.minimum(error**2, 9) + np.minimum(spread**2, 9)).sum()) / _ALIKE
         # The volume that passes is one at all heights: it gives the radius at the top.
-        area = np.exp(np.median(thinning)) / np.sqrt(speed**2 + (path[1] ** 2).sum())
-        steady = np.median(error) * _MIDDLE < _ASTRAY and np.median(spread) * _AREA < _UNEVEN
+        area = np.exp(np.median(thinning)) / speed
+        steady = np.median(error) * _MIDDLE < _ASTRAY and np.median(unlike) < _UNEVEN
         paths.append((path, float(np.sqrt(area / np.pi))) if steady else None)
     return cost, speed, paths
 

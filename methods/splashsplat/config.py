@@ -41,7 +41,7 @@ class SplashSplatConfig(MethodConfig):
     #: level the liquid that rests in the container (needs the mesh and gravity)
     pool: bool = True
     # Velocity
-    #: free fall for the jet (needs gravity and the metric scale)
+    #: free fall for the jet (needs gravity, the metric scale and the frames' times)
     ballistic: bool = True
     #: no motion where the level set's does not lead nearer to the next observation
     gate_motion: bool = True

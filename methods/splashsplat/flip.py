@@ -210,9 +210,12 @@ def _normals(solid: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def gravity_in_voxels(scene: Scene | TrainingScene, grid: Grid) -> np.ndarray:
-    """Gravity in voxels of `grid` per second squared, float64 [3]. Raises SplashbenchError where it is unknown."""
-    if scene.gravity is None or scene.metres_per_unit is None:
-        missing = "gravity" if scene.gravity is None else "metres_per_unit"
+    """Gravity in voxels of `grid` per second squared, float64 [3].
+
+    Raises SplashbenchError where it, or the frames' times, are unknown.
+    """
+    if scene.gravity is None or scene.metres_per_unit is None or scene.times_source == "nominal":
+        missing = next((name for name in ("gravity", "metres_per_unit") if getattr(scene, name) is None), "times")
         raise SplashbenchError(
             f"scene {scene.name}: FLIP needs {missing}, which the scene does not tell; add it to scene.json"
         )

@@ -66,7 +66,7 @@ class FittedSplashSplat(Fitted):
         """The carriers."""
         return self.liquid.particles()
 
-    def signed_distance(self) -> SignedDistance:
+    def signed_distance(self) -> SignedDistance | None:
         """phi of every frame, as the carriers were held to it."""
         return self.liquid.signed_distance()
 

@@ -18,10 +18,10 @@ from splashbench_methods.splashsplat.velocity import velocities_at
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_npz, write_json
 from splashbench.observe.grid import Grid
-from splashbench.scene.geometry import STEPS_PER_VOXEL, SignedDistance
+from splashbench.scene.geometry import MAX_BYTES, STEPS_PER_VOXEL, SignedDistance
 from splashbench.scene.particles import Particles
 
-FORMAT = 1
+FORMAT = 2
 # phi is needed between frames only and matters within a few voxels of the interface: 1/16 voxel, up to +-7.9 voxels.
 PHI_STEPS_PER_VOXEL = STEPS_PER_VOXEL
 
@@ -54,6 +54,7 @@ class Liquid:
 
     times: [T] seconds. grid: the transport grid. carriers: in store precision. velocities: float16 [T - 1, cx, cy,
     cz, 3], voxels per frame. factor: transport voxels per control cell. phi: int8 [T, nx, ny, nz], see `pack_phi`.
+    carried: whether the velocities are what moved the carriers.
     """
 
     times: np.ndarray
@@ -63,6 +64,7 @@ class Liquid:
     factor: int
     phi: np.ndarray
     appearance: Appearance
+    carried: bool = True
 
     @classmethod
     def of(
@@ -81,7 +83,10 @@ class Liquid:
         return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance)
 
     def particles(self) -> Particles:
-        """The carriers as particles, with the velocity of the liquid where they are, scene units per second."""
+        """The carriers as particles, with the velocity of the liquid where they are, scene units per second.
+
+        Without velocities where others than the model's moved them (the variants FLIP and per-frame).
+        """
         n_frames, count = self.carriers.n_frames, self.carriers.count
         positions = np.zeros((n_frames, count, 3), dtype=np.float32)
         velocities = np.zeros_like(positions)
@@ -97,11 +102,11 @@ class Liquid:
                 seconds = self.times[step + 1] - self.times[step]
                 control = self.velocities[step].astype(np.float32)
                 velocities[t, ids] = velocities_at(control, self.factor, x) * (self.grid.voxel / seconds)
-        return Particles(positions=positions, active=active, velocities=velocities)
+        return Particles(positions, active, velocities if self.carried else None)
 
-    def signed_distance(self) -> SignedDistance:
-        """phi_t of every frame on the transport grid."""
-        return SignedDistance(self.phi, self.grid.origin, self.grid.voxel)
+    def signed_distance(self) -> SignedDistance | None:
+        """phi_t of every frame on the transport grid; None where that is more than a submission may hold."""
+        return None if self.phi.nbytes > MAX_BYTES else SignedDistance(self.phi, self.grid.origin, self.grid.voxel)
 
     def save(self, directory: Path) -> None:
         """Write liquid.json and four .npz files into `directory`."""
@@ -116,6 +121,7 @@ class Liquid:
             },
             "factor": self.factor,
             "carriers": self.carriers.count,
+            "carried": self.carried,
             "decoder": dict(vars(settings)),
         }
         write_json(directory / "liquid.json", header)
@@ -152,6 +158,7 @@ class Liquid:
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
             times = np.array(header["times"], dtype=np.float64)
             factor, count = int(header["factor"]), int(header["carriers"])
+            carried = bool(header["carried"])
             decoder = Decoder(DecoderSettings(**header["decoder"]))
         except (KeyError, TypeError, ValueError) as error:
             raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); fit the scene again") from None
@@ -180,4 +187,4 @@ class Liquid:
             torch.from_numpy(tables["log_scales"].astype(np.float32)),
             decoder,
         )
-        return cls(times, grid, carriers, velocities, factor, phi, appearance)
+        return cls(times, grid, carriers, velocities, factor, phi, appearance, carried)

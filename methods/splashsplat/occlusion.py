@@ -9,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
+from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
 from splashbench.observe.container import depth_image, hidden
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
 _FILE = "container.npz"
+# Cameras whose depth images are held; the oldest goes.
+_KEPT = 24
 
 
 class Occlusion:
@@ -31,6 +34,8 @@ class Occlusion:
         """Depth of the container in `camera`'s image, float32 [H, W], inf where there is none."""
         # By identity, as arrays make no key; the camera is kept so that its number is not given to another.
         if id(camera) not in self._depths:
+            if len(self._depths) >= _KEPT:
+                self._depths.pop(next(iter(self._depths)))
             self._depths[id(camera)] = camera, depth_image(self.mesh, camera)
         return self._depths[id(camera)][1]
 
@@ -46,9 +51,12 @@ class Occlusion:
 
     @classmethod
     def load(cls, directory: Path) -> Occlusion | None:
-        """Read what `save` wrote; None where `directory` has none."""
+        """Read what `save` wrote; None where `directory` has none. Raises SplashbenchError naming the file at fault."""
         path = directory / _FILE
         if not path.is_file():
             return None
         arrays = read_npz(path, {"vertices": 2, "faces": 2, "tolerance": 1})
-        return cls(ContainerMesh(arrays["vertices"], arrays["faces"]), float(arrays["tolerance"][0]))
+        try:
+            return cls(ContainerMesh(arrays["vertices"], arrays["faces"]), float(arrays["tolerance"][0]))
+        except (ValueError, IndexError) as error:
+            raise SplashbenchError(f"{path} is not a container ({error}); fit the scene again") from None

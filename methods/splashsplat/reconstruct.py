@@ -28,6 +28,7 @@ from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_dista
 from splashbench.observe.container import solid_distance
 from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.kernels import resample
+from splashbench.observe.reduced import reduced
 from splashbench.observe.shadow import ContainerShadow
 from splashbench.observe.signed_distance import PADDING
 from splashbench.render.torch_threads import one_torch_thread
@@ -51,10 +52,13 @@ class Observations:
     def __init__(self, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report) -> None:
         self._config, self._run, self._report = config, run, report
         self._times = scene.times
+        report(0.0, "reading masks")
         with run.stage("signed distance"):
-            self.silhouettes = Silhouettes(scene, interpolate_times=None if config.camera_times else False)
+            observed = reduced(scene, config.hull_cells) if config.distance == "silhouette" else scene
+            self.silhouettes = Silhouettes(observed, interpolate_times=None if config.camera_times else False)
             self._container = ContainerShadow.of(scene) if config.container else None
         if config.detect_failures:
+            report(0.0, "looking for failed masks")
             with run.stage("failed masks"):
                 distrust_failed_masks(self.silhouettes, self._container)
         with run.stage("signed distance"):
@@ -68,13 +72,14 @@ class Observations:
         self._shadows = [None if self.occlusion is None else self.occlusion.depth(camera) for camera in cameras]
         self._survey: Survey | None = None
         if scene.gravity is not None and (config.pool or config.ballistic):
+            report(0.0, "looking for the jet and the pool")
             with run.stage("survey"):
                 self._survey = survey(
                     self.silhouettes,
                     bounds,
                     self._container,
                     scene.gravity,
-                    scene.metres_per_unit,
+                    None if scene.times_source == "nominal" else scene.metres_per_unit,
                     scene.times,
                     self._shadows,
                     find_pool=config.pool,
@@ -123,7 +128,7 @@ class Observations:
         return end if self._survey is None else self._survey.landed(self.grid, t, start, end)
 
     def simulation(self, scene: TrainingScene, seed: int) -> Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]:
-        """Starts FLIP from the first carriers. Raises SplashbenchError where gravity or the scale are not known."""
+        """Starts FLIP from the first carriers. Raises SplashbenchError where it is not known how things fall."""
         gravity = gravity_in_voxels(scene, self.grid)
         mesh = scene.container_mesh()
         solid = None if mesh is None else solid_distance(mesh, self.grid)
@@ -138,8 +143,9 @@ class Observations:
 
     def seen(self, phi: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Which hull-grid coordinates `points` [N, 3] the training views see in phi (transport voxels): bool [N]."""
-        limit = SEEN_THROUGH * self._config.shell_depth * self.grid.voxel / self.hull_grid.voxel
-        return seen_by_any(phi, self.hull_grid, points, self.silhouettes.cameras, self._shadows, limit)
+        ratio = self.grid.voxel / self.hull_grid.voxel
+        limit = SEEN_THROUGH * self._config.shell_depth * ratio
+        return seen_by_any(phi, self.hull_grid, points, self.silhouettes.cameras, self._shadows, limit, ratio)
 
 
 @dataclass(frozen=True)
@@ -210,6 +216,8 @@ def fit_liquid(
             )
         carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
     liquid = Liquid.of(scene.times, grid, carriers, observations.velocities, factor, observations.packed, appearance)
+    # What moves the carriers of the other variants is not u_t.
+    liquid.carried = config.variant in ("full", "no_resampling")
     return liquid, occlusion
 
 

@@ -87,8 +87,8 @@ def survey(
 ) -> Survey:
     """Look at all frames on a coarse grid over `bounds`.
 
-    gravity: unit vector [3]. metres_per_unit: None where the scale is not known; then no jet is looked for, as the
-    speed of a fall is not known either. shadows: per view the container's depth image, or None.
+    gravity: unit vector [3]. metres_per_unit: None where the scale or the frames' times are not known; then no jet is
+    looked for, as the speed of a fall is not known either. shadows: per view the container's depth image, or None.
     """
     turn = upright(gravity)
     vessel = None if container is None else Vessel.of(container.mesh, gravity)

@@ -30,6 +30,7 @@ def _seen(
     shadow: np.ndarray,
     tolerance: float,
     limit: float,
+    scale: float,
     seen: np.ndarray,
     start: int,
     stop: int,
@@ -57,7 +58,7 @@ def _seen(
             a, b, c = x + way * dx, y + way * dy, z + way * dz
             if a < 0 or b < 0 or c < 0 or a > top_x or b > top_y or c > top_z:
                 break
-            value = trilinear(phi, a, b, c)
+            value = scale * trilinear(phi, a, b, c)
             if value < 0:
                 crossed += _STEP
                 if crossed > limit:
@@ -75,11 +76,13 @@ def seen_by_any(
     cameras: Sequence[Camera],
     shadows: Sequence[np.ndarray | None],
     limit: float,
+    scale: float = 1.0,
 ) -> np.ndarray:
     """bool [N]: whether a camera sees `points` [N, 3] (node coordinates of `grid`) through at most `limit` voxels of
     liquid.
 
-    phi: signed distance on `grid`, float32, voxels. shadows: the container's depth image of each camera, or None.
+    phi: signed distance on `grid`, float32; `scale` makes voxels of it. shadows: the container's depth image of each
+    camera, or None.
     """
     seen = np.zeros(len(points), dtype=bool)
     points = np.ascontiguousarray(points, dtype=np.float32)
@@ -95,6 +98,7 @@ def seen_by_any(
             np.zeros((0, 0), np.float32) if shadow is None else shadow,
             grid.voxel,
             float(limit),
+            float(scale),
         )
         over_range(_seen, len(points), *fixed, seen, smallest=_SMALL_LOOP)
     return seen

@@ -16,6 +16,7 @@ from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.kernels import carve_view
 from splashbench.observe.shadow import LIMIT_VOXELS, CarvingContainer, ContainerShadow, focal_length
 from splashbench.observe.silhouettes import MaskedScene, Silhouettes, Window
+from splashbench.parallel import each
 
 SEARCH_CELLS = 64
 REFINED_CELLS = 96
@@ -29,8 +30,10 @@ def carve(
 ) -> np.ndarray:
     """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v."""
     phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32) if container is None else container.outside.copy()
-    for view in range(len(silhouettes.cameras)):
-        _carve_with(phi, silhouettes, grid, view, distance, container)
+    for carve_with in each(
+        lambda view: _carver(silhouettes, view, distance, container), range(len(silhouettes.cameras))
+    ):
+        carve_with(phi, grid)
     return phi
 
 
@@ -43,38 +46,34 @@ def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: Carving
 
 def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingContainer | None = None) -> np.ndarray:
     """What each view alone is certain of in frame `t`: float32 [V, nx, ny, nz] in voxels, < 0 in its silhouette."""
-    each = np.full((len(silhouettes.cameras), *grid.shape), -LIMIT_VOXELS, dtype=np.float32)
-    for view, phi in enumerate(each):
-        _carve_with(
-            phi, silhouettes, grid, view, lambda v, window: silhouettes.certain_distance(v, t, window), container
-        )
-    return each
+    views = np.full((len(silhouettes.cameras), *grid.shape), -LIMIT_VOXELS, dtype=np.float32)
+    carvers = each(
+        lambda view: _carver(
+            silhouettes, view, lambda v, window: silhouettes.certain_distance(v, t, window), container
+        ),
+        range(len(views)),
+    )
+    for phi, carve_with in zip(views, carvers):
+        carve_with(phi, grid)
+    return views
 
 
-def _carve_with(
-    phi: np.ndarray,
-    silhouettes: Silhouettes,
-    grid: Grid,
-    view: int,
-    distance: Distance,
-    container: CarvingContainer | None,
-) -> None:
-    """phi = max(phi, what view number `view` says), in place."""
+def _carver(
+    silhouettes: Silhouettes, view: int, distance: Distance, container: CarvingContainer | None
+) -> Callable[[np.ndarray, Grid], None]:
+    """What view number `view` says, as a function of phi and its grid: phi = max(phi, that), in place."""
     if container is not None and container.views:
         shadow = container.views[view]
-        shadow.carve(phi, grid, shadow.evidence(distance(view, shadow.window)))
-        return
-    camera = silhouettes.cameras[view]
-    carve_view(
-        phi,
-        grid.origin,
-        grid.voxel,
-        camera.projection,
-        focal_length(camera),
-        distance(view, None),
-        silhouettes.windows[view].corner,
-        LIMIT_VOXELS,
-    )
+        evidence = shadow.evidence(distance(view, shadow.window))
+        return lambda phi, grid: shadow.carve(phi, grid, evidence)
+    camera, corner = silhouettes.cameras[view], silhouettes.windows[view].corner
+    silhouette = distance(view, None)
+
+    def carve_with(phi: np.ndarray, grid: Grid) -> None:
+        focal = focal_length(camera)
+        carve_view(phi, grid.origin, grid.voxel, camera.projection, focal, silhouette, corner, LIMIT_VOXELS)
+
+    return carve_with
 
 
 def _inside(phi: np.ndarray, grid: Grid, tolerance: float) -> Bounds | None:

@@ -61,9 +61,15 @@ def signed_distance_of(occupied: np.ndarray) -> np.ndarray:
         return np.full(occupied.shape, LIMIT_VOXELS, dtype=np.float32)
     if occupied.all():
         return np.full(occupied.shape, -LIMIT_VOXELS, dtype=np.float32)
-    inside, outside = distance_transform_edt(occupied), distance_transform_edt(~occupied)
-    distance = np.where(occupied, 0.5 - inside, outside - 0.5)
-    return np.clip(distance, -LIMIT_VOXELS, LIMIT_VOXELS).astype(np.float32)
+    # Farther from the liquid than the limit nothing is to be found out.
+    reach = int(np.ceil(LIMIT_VOXELS)) + 1
+    spans = [np.nonzero(occupied.any(axis=axes))[0][[0, -1]] for axes in ((1, 2), (0, 2), (0, 1))]
+    near = tuple(slice(max(first - reach, 0), last + reach + 1) for first, last in spans)
+    part = occupied[near]
+    inside, outside = distance_transform_edt(part), distance_transform_edt(~part)
+    distance = np.full(occupied.shape, LIMIT_VOXELS, dtype=np.float32)
+    distance[near] = np.clip(np.where(part, 0.5 - inside, outside - 0.5), -LIMIT_VOXELS, LIMIT_VOXELS)
+    return distance
 
 
 def signed_distance_frames(

@@ -234,12 +234,15 @@ def test_velocities_are_read_off_the_control_grid():
     np.testing.assert_allclose(velocities_at(middles @ slope, 4, points), points @ slope, atol=1e-5)
 
 
-def test_gravity_needs_scale_and_direction():
+def test_gravity_needs_scale_direction_and_times():
     class Known:
-        name, gravity, metres_per_unit = "known", np.array([0.0, -1, 0]), 0.5
+        name, gravity, metres_per_unit, times_source = "known", np.array([0.0, -1, 0]), 0.5, "scene.json"
 
     grid = Grid(np.zeros(3), 0.01, CUBE)
     np.testing.assert_allclose(gravity_in_voxels(Known(), grid), [0, -9.81 / 0.5 / 0.01, 0])
+    Known.times_source = "nominal"
+    with pytest.raises(SplashbenchError, match=r"known: FLIP needs times.*scene\.json"):
+        gravity_in_voxels(Known(), grid)
     Known.metres_per_unit = None
     with pytest.raises(SplashbenchError, match=r"known: FLIP needs metres_per_unit.*scene\.json"):
         gravity_in_voxels(Known(), grid)

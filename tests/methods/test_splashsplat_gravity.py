@@ -71,7 +71,7 @@ def falling(speed: float, drift: float, flow: float = 6e-4, wander: float = 0.0,
         middle = np.stack([0.01 + wander * t + drift * fall, -0.02 + 0 * fall], axis=1)
         rng = np.random.default_rng(t)
         middle += rng.normal(0, 0.1 * VOXEL, middle.shape)
-        area = flow / np.sqrt(down**2 + drift**2) * np.exp(rng.normal(0, 0.05, len(height)))
+        area = flow / down * np.exp(rng.normal(0, 0.05, len(height)))
         frames.append(Slices(height, middle, area))
     return frames
 
@@ -90,8 +90,9 @@ def test_a_jets_speed_follows_from_its_shape(speed, drift, wander):
         np.testing.assert_allclose(found[:, 1], 0, atol=0.05)
 
 
-def test_a_jets_axis_and_width_lead_through_its_slices():
-    frames = falling(1.0, 0.35)
+@pytest.mark.parametrize(("speed", "drift"), [(1.0, 0.35), (0.5, 1.0)])
+def test_a_jets_axis_and_width_lead_through_its_slices(speed, drift):
+    frames = falling(speed, drift)
     jet = fit_jets(frames, np.arange(9) * 0.05, G, VOXEL)[4]
     axis = np.concatenate([frames[4].middle, frames[4].height[:, None]], axis=1)
     assert (jet.distance(axis) < 0).all()

@@ -151,6 +151,13 @@ def test_flip_keeps_the_first_carriers_only_and_moves_them_by_gravity(balls_copy
     assert counts == sorted(counts, reverse=True)
 
 
+def test_a_saved_container_that_is_broken_is_named(tmp_path: Path):
+    faces = np.array([[0, 1, 9]])
+    np.savez_compressed(tmp_path / "container.npz", vertices=np.eye(3), faces=faces, tolerance=np.ones(1))
+    with pytest.raises(SplashbenchError, match=r"container\.npz"):
+        Occlusion.load(tmp_path)
+
+
 def test_stages_of_the_fit_are_told(balls_copy: Path):
     cut(balls_copy, 2)
     run = Run(seed=0)

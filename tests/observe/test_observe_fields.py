@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from splashbench.errors import SplashbenchError
 from splashbench.observe import Bounds, Grid, Silhouettes, sequence_bounds, signed_distance_fields
@@ -190,3 +191,12 @@ def test_the_same_fields_on_any_number_of_threads(monkeypatch, fields):
     monkeypatch.setattr(parallel, "thread_count", lambda: 1)
     alone = signed_distance_fields(Ball(), cells_longest_axis=48)
     np.testing.assert_array_equal(alone.phi, fields.phi)
+
+
+def test_the_distance_of_a_small_liquid_in_a_large_grid_is_that_of_the_whole_grid():
+    occupied = np.zeros((70, 64, 60), dtype=bool)
+    occupied[2:5, 30:34, 28:30] = True
+    occupied[10, 31, 29] = True
+    inside, outside = (ndimage.distance_transform_edt(part) for part in (occupied, ~occupied))
+    expected = np.clip(np.where(occupied, 0.5 - inside, outside - 0.5), -20, 20).astype(np.float32)
+    np.testing.assert_array_equal(signed_distance_of(occupied), expected)

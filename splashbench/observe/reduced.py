@@ -1,0 +1,62 @@
+"""Masks at the resolution that a hull can use.
+
+Carving needs the outline of a silhouette to a fraction of a voxel. Where a voxel is many pixels wide, distances in full
+images are time spent on nothing: the masks are averaged over squares of pixels first, and the cameras with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from splashbench.observe.silhouettes import MaskedScene, Window
+from splashbench.scene.camera import Camera
+
+#: pixels per voxel that are kept, at least
+PIXELS_PER_VOXEL = 2.0
+
+
+class ReducedScene:
+    """`scene` with masks and cameras reduced by the whole number `factor`; other images are not there.
+
+    A pixel is liquid where a line across its square would be: thin streams stay whole.
+    """
+
+    def __init__(self, scene: MaskedScene, factor: int) -> None:
+        self._scene, self.factor = scene, factor
+        self.name, self.train, self.n_frames = scene.name, scene.train, scene.n_frames
+        self.cameras = {name: _reduced(camera, factor) for name, camera in scene.cameras.items()}
+        # What `Silhouettes` looks for in scenes whose cameras have times of their own.
+        self.times = getattr(scene, "times", None)
+        self.camera_times = getattr(scene, "camera_times", {})
+
+    def mask(self, camera: str, t: int) -> np.ndarray:
+        """Liquid mask of `camera` in frame `t`: bool [h, w]."""
+        view, factor = self.cameras[camera], self.factor
+        mask = self._scene.mask(camera, t)
+        beyond = view.height * factor - mask.shape[0], view.width * factor - mask.shape[1]
+        squares = np.pad(mask, ((0, beyond[0]), (0, beyond[1]))).reshape(view.height, factor, view.width, factor)
+        return np.count_nonzero(squares, axis=(1, 3)) >= factor
+
+
+def _reduced(camera: Camera, factor: int) -> Camera:
+    K = np.diag([1 / factor, 1 / factor, 1.0]) @ camera.K
+    return replace(camera, width=-(-camera.width // factor), height=-(-camera.height // factor), K=K)
+
+
+def reduced(scene: MaskedScene, cells: int) -> MaskedScene:
+    """`scene`, reduced as far as a hull of `cells` voxels along the liquid's longest side allows.
+
+    The longest side is taken from what the views ever see of the liquid, in the view that sees it smallest.
+    """
+    longest = []
+    for view in scene.train:
+        windows = [Window.around(mask) for mask in (scene.mask(view, t) for t in range(scene.n_frames)) if mask.any()]
+        if windows:
+            whole = windows[0]
+            for window in windows[1:]:
+                whole = whole.joined(window)
+            longest.append(max(whole.shape))
+    factor = int(min(longest) / cells / PIXELS_PER_VOXEL) if longest else 1
+    return ReducedScene(scene, factor) if factor > 1 else scene
