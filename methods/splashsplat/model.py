@@ -76,11 +76,12 @@ class Liquid:
         factor: int,
         phi: np.ndarray,
         appearance: Appearance,
+        carried: bool = True,
     ) -> Liquid:
         """Bring the learned tables and velocities to the precision of the files."""
         halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
         appearance = Appearance(halves[0], halves[1], appearance.decoder)
-        return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance)
+        return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance, carried)
 
     def particles(self) -> Particles:
         """The carriers as particles, with the velocity of the liquid where they are, scene units per second.

@@ -30,14 +30,14 @@ def gated(control: np.ndarray, factor: int, before: np.ndarray, after: np.ndarra
 
     control: float32 [cx, cy, cz, 3] voxels per frame. before, after: phi_t and phi_{t+1}, float32 [nx, ny, nz] voxels.
     """
+    if not np.any(control):
+        return control
     coarse = control.shape[:3]
     size = int(np.prod(coarse))
     gains, counts = np.zeros(size), np.zeros(size)
     # Forwards from what is liquid now, which shows where it leaves, and backwards from what will be, where it arrives.
     for here, there, direction in ((before, after, 1), (after, before, -1)):
         nodes = np.argwhere((here <= 0) & (here >= -_SHELL)).astype(np.float32)
-        if len(nodes) == 0 or not np.any(control):
-            return control
         identity = np.broadcast_to(np.eye(3, dtype=np.float32), (len(nodes), 3, 3))
         moved, _ = forecast(direction * control, factor, nodes, identity)
         gain = np.maximum(sample(there, nodes), 0) - np.maximum(sample(there, moved), 0)

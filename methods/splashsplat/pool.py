@@ -23,6 +23,7 @@ from splashbench_methods.splashsplat.ballistic import Jet
 from splashbench.observe.container import solid_distance
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.kernels import sample, trilinear
+from splashbench.observe.shadow import focal_length
 from splashbench.observe.silhouettes import Silhouettes, signed_distance_2d
 from splashbench.parallel import over_range
 from splashbench.scene.camera import Camera
@@ -250,11 +251,10 @@ class Pool:
             removal = np.minimum(removal, jet.distance(points @ self.vessel.turn.T).astype(np.float32) / grid.voxel - 1)
         for view, shadow in zip(self.views, shadows):
             explained = signed_distance_2d(view.heights <= level) * np.float32(view.stride)
-            focal = 0.5 * float(view.camera.K[0, 0] + view.camera.K[1, 1])
             fixed = (
                 points,
                 np.ascontiguousarray(view.camera.projection),
-                focal * grid.voxel,
+                focal_length(view.camera) * grid.voxel,
                 explained,
                 view.corner,
                 view.stride,

@@ -215,10 +215,10 @@ def fit_liquid(
                 lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
             )
         carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
-    liquid = Liquid.of(scene.times, grid, carriers, observations.velocities, factor, observations.packed, appearance)
     # What moves the carriers of the other variants is not u_t.
-    liquid.carried = config.variant in ("full", "no_resampling")
-    return liquid, occlusion
+    carried = config.variant in ("full", "no_resampling")
+    velocities, packed = observations.velocities, observations.packed
+    return Liquid.of(scene.times, grid, carriers, velocities, factor, packed, appearance, carried), occlusion
 
 
 def _pruned(carriers: Carriers, appearance: Appearance, threshold: float) -> tuple[Carriers, Appearance]:

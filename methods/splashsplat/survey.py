@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from splashbench_methods.splashsplat.ballistic import Jet, Slices, fit_jets, framed, open_floor, slices_of
+from splashbench_methods.splashsplat.flip import STANDARD_GRAVITY
 from splashbench_methods.splashsplat.pool import Pool, Vessel, upright
 
 from splashbench.observe.grid import Bounds, Grid
@@ -16,8 +17,6 @@ from splashbench.observe.shadow import ContainerShadow
 from splashbench.observe.signed_distance import signed_distance_frames
 from splashbench.observe.silhouettes import Silhouettes
 
-#: m / s^2
-GRAVITY = 9.81
 _CELLS = 96
 # What is within so many voxels above a container's rim may rest on it.
 _RIM_MARGIN = 4
@@ -106,5 +105,5 @@ def survey(
             frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))
         floor = open_floor(frames, grid.voxel) if vessel is None else vessel.rim + _RIM_MARGIN * grid.voxel
         airborne = [framed(frame.above(floor), silhouettes.cameras, turn) for frame in frames]
-        jets = fit_jets(airborne, times, GRAVITY / metres_per_unit, grid.voxel)
+        jets = fit_jets(airborne, times, STANDARD_GRAVITY / metres_per_unit, grid.voxel)
     return Survey(turn, jets, floor, pool, levels, shadows)

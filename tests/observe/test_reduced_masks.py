@@ -68,7 +68,8 @@ def test_the_hull_is_the_same_to_a_fraction_of_a_voxel(factor: int):
     near = np.abs(full) < 3
     pixels_per_voxel = 900 / 4 * grid.voxel / factor
     assert np.abs(full - small)[near].max() < 1.5 / pixels_per_voxel
-    assert np.abs((full - small)[near].mean()) < 0.15
+    # A line across a square fills it: the outline moves out, by less than half a reduced pixel.
+    assert 0 <= (full - small)[near].mean() < 0.5 / pixels_per_voxel
 
 
 def test_masks_are_reduced_only_as_far_as_the_hull_allows():
