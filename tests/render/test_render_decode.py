@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from splashbench_methods.splashsplat.decoder import CarrierState, ColourCells, Decoder, DecoderSettings
+from splashbench_methods.splashsplat.decoder import CarrierState, ColourCells, Decoder, DecoderSettings, penalties
 from splashbench_methods.splashsplat.optimizer import TorchRowMoments
 
 from splashbench.render import cpu
@@ -39,6 +39,21 @@ def case(n: int, seed: int = 0, hidden_from_view: bool = False, **sizes: int) ->
     return decoder, features, log_scales, rows, state, torch.tensor([1.0, -2, 3]), ColourCells(cells, counts.float())
 
 
+class PlainDecoder(Decoder):
+    """The definition in torch, in single precision as well."""
+
+    def decode(self, features, log_scales, rows, state, eye, cells=None):
+        children = self(features[rows], log_scales[rows], state, eye)
+        return children, None if cells is None else penalties(children, cells)
+
+
+def plain(given: Case) -> Case:
+    """The same case, decoded by plain torch."""
+    decoder = PlainDecoder(given[0].settings)
+    decoder.load_state_dict(given[0].state_dict())
+    return decoder, *given[1:]
+
+
 def outcome(given: Case, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     """Children, penalties, and the gradients of a sum of all of them with weights."""
     decoder, features, log_scales, rows, state, eye, cells = given
@@ -55,26 +70,32 @@ def outcome(given: Case, dtype: torch.dtype) -> dict[str, torch.Tensor]:
         loss = loss + (value * weight.to(dtype)).sum() * (1 if name in vars(children) else len(rows))  # means
     (*by_tables,) = torch.autograd.grad(loss, [*tables, *decoder.parameters()])
     names = ["features", "log_scales", *dict(decoder.named_parameters())]
-    gradients = {f"grad {name}": grad.to_dense() for name, grad in zip(names, by_tables)}
+    gradients = {f"grad {name}": grad.to_dense() if grad.is_sparse else grad for name, grad in zip(names, by_tables)}
     return {name: value.detach() for name, value in values.items()} | gradients
 
 
-def assert_same(got: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    """Weight and bias of a layer have one yardstick: their gradients are sums over the carriers, and that of a single
-    number may be near zero because its terms cancel. Penalties are squares of differences that float32 has to 1e-7."""
-    assert got.keys() == wanted.keys()
-    errors, sizes = defaultdict(list), defaultdict(list)
+def assert_same(got: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], plain: dict[str, torch.Tensor]) -> None:
+    """`got` is as near to `wanted`, in double precision, as single precision allows: `plain` shows how near that is.
+
+    Gradients of weights are sums over the carriers whose terms may cancel; how much is lost by that, only the
+    definition in single precision can tell. Weight and bias of a layer have one yardstick.
+    """
+    assert got.keys() == wanted.keys() == plain.keys()
+    errors, unavoidable, sizes = defaultdict(list), defaultdict(list), defaultdict(list)
     for name, value in wanted.items():
         assert got[name].shape == value.shape
-        assert got[name].dtype == torch.float32
+        assert got[name].dtype == plain[name].dtype == torch.float32
         layer = name.removesuffix(".weight").removesuffix(".bias")
         errors[layer].append(float((got[name].double() - value).norm()))
+        unavoidable[layer].append(float((plain[name].double() - value).norm()))
         sizes[layer].append(float(value.norm()))
     for layer, own in errors.items():
-        assert math.hypot(*own) <= 1e-5 * math.hypot(*sizes[layer]) + 1e-9, f"{layer} is off by {own}"
+        limit = 1e-5 * math.hypot(*sizes[layer]) + 4 * math.hypot(*unavoidable[layer]) + 1e-9
+        assert math.hypot(*own) <= limit, f"{layer} is off by {own}"
 
 
-@settings(max_examples=25, deadline=None)
+@example(n=2, feature_size=24, children=1, colour_width=1, hidden_from_view=True, seed=163)  # terms cancel
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     n=st.sampled_from([0, 1, 2, 63, 64, 65, 130, 600]),
     feature_size=st.integers(1, 40),
@@ -85,7 +106,7 @@ def assert_same(got: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -
 )
 def test_children_and_gradients_are_those_of_the_definition(n, seed, hidden_from_view, **sizes):
     given = case(n, seed, hidden_from_view, **sizes)
-    assert_same(outcome(given, torch.float32), outcome(given, torch.float64))
+    assert_same(outcome(given, torch.float32), outcome(given, torch.float64), outcome(plain(given), torch.float32))
 
 
 def test_the_number_of_threads_does_not_matter():

@@ -50,7 +50,7 @@ def outcome(given: Case, kernel: bool) -> list[torch.Tensor]:
     return [term.detach() for term in terms] + list(gradients)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     rows=st.sampled_from([1, 2, 15, 16, 17, 40]),
     columns=st.integers(1, 40),
