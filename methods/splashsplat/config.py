@@ -36,7 +36,7 @@ class SplashSplatConfig(MethodConfig):
     container: bool = True
     #: tell masks with much missing, beside empty ones
     detect_failures: bool = True
-    #: carve with each camera's own times, where the scene has them
+    #: carve, and compare photographs, at each camera's own times, where the scene has them
     camera_times: bool = True
     #: level the liquid that rests in the container (needs the mesh and gravity)
     pool: bool = True

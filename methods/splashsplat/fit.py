@@ -14,9 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from splashbench_methods.splashsplat import losses
-from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import (
-    CarrierState,
     Children,
     ColourCells,
     Decoder,
@@ -25,11 +23,11 @@ from splashbench_methods.splashsplat.decoder import (
     initial_log_scale,
 )
 from splashbench_methods.splashsplat.optimizer import RowAdam
+from splashbench_methods.splashsplat.subframe import Track
 from splashbench_methods.splashsplat.targets import Target
 from torch import Tensor
 
 from splashbench.errors import SplashbenchError
-from splashbench.observe.grid import Grid
 from splashbench.render import rasterize
 from splashbench.render.window_loss import window_losses
 from splashbench.scene.camera import Camera
@@ -109,28 +107,16 @@ def total_loss(
     return loss
 
 
-def frame_states(carriers: Carriers, grid: Grid) -> list[CarrierState]:
-    """Decoder input of every frame, positions in scene units."""
-    states = []
-    for t in range(carriers.n_frames):
-        rows = carriers.rows(t)
-        positions = torch.from_numpy(grid.to_scene(carriers.positions[rows]).astype(np.float32))
-        deformation = torch.from_numpy(carriers.deformation[rows])
-        states.append(CarrierState(positions, deformation, torch.from_numpy(carriers.phi[rows])))
-    return states
-
-
-def _colour_cells(carriers: Carriers, t: int, size: float) -> ColourCells:
+def _colour_cells(track: Track, t: int, size: float) -> ColourCells:
     """The cells of frame `t`'s carriers, of `size` transport voxels."""
-    keys = np.floor(carriers.positions[carriers.rows(t)] / size).astype(np.int64)
+    keys = np.floor(track.carriers.positions[track.carriers.rows(t)] / size).astype(np.int64)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     return ColourCells(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32)))
 
 
 def fit_appearance(
     appearance: Appearance,
-    carriers: Carriers,
-    grid: Grid,
+    track: Track,
     targets: list[Target],
     settings: FitSettings,
     colour_cell: float,
@@ -141,9 +127,9 @@ def fit_appearance(
 
     Raises SplashbenchError where the loss stops being finite.
     """
-    states = frame_states(carriers, grid)
-    ids = [torch.from_numpy(carriers.ids[carriers.rows(t)].astype(np.int64)) for t in range(len(states))]
-    cells = [_colour_cells(carriers, t, colour_cell) for t in range(len(states))]
+    frames = range(track.carriers.n_frames)
+    states, ids = [track.state(t) for t in frames], [track.ids(t) for t in frames]
+    cells = [_colour_cells(track, t, colour_cell) for t in frames]
     decoder = appearance.decoder
     parameters = list(decoder.parameters())
     heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
@@ -158,12 +144,14 @@ def fit_appearance(
             queue = rng.permutation(len(targets)).tolist()
         target = targets[queue.pop()]
         active = ids[target.frame]
-        state = replace(states[target.frame], visibility=target.visibility)
+        # Kept for the frames alone: one for every photograph would be a gigabyte on large scenes.
+        state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
+        state = replace(state, visibility=target.visibility)
         children, penalties = decoder.decode(features, log_scales, active, state, target.eye, cells[target.frame])
         image, alpha = composite(children, target.camera, target.background)
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
-        loss = total_loss(penalties, image, alpha, target, grid.voxel, settings.weights, ssim_weight)
+        loss = total_loss(penalties, image, alpha, target, track.grid.voxel, settings.weights, ssim_weight)
         history.append(float(loss.detach()))
         if not math.isfinite(history[-1]):
             raise SplashbenchError(

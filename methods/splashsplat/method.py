@@ -13,7 +13,6 @@ from splashbench_methods.splashsplat.fit import composite
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.occlusion import Occlusion
 from splashbench_methods.splashsplat.reconstruct import fit_liquid
-from splashbench_methods.splashsplat.subframe import state_at
 
 from splashbench.adapter.contract import Fitted, Method, Render, Run, Support
 from splashbench.render.torch_threads import one_torch_thread
@@ -49,7 +48,7 @@ class FittedSplashSplat(Fitted):
     def render(self, camera: Camera, time: float) -> Render:
         """The view of `camera` at `time` (seconds), any time: between frames the carriers are advected."""
         background = torch.from_numpy(self._background(camera))
-        ids, state = state_at(self.liquid, time)
+        ids, state = self.liquid.track.at(self.liquid.times, time)
         if len(ids) == 0:
             return Render(background.numpy().copy(), np.zeros(background.shape[:2], dtype=np.float32))
         if self.occlusion is not None:

@@ -13,17 +13,16 @@ import torch
 from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.fit import Appearance
+from splashbench_methods.splashsplat.subframe import Track
 from splashbench_methods.splashsplat.velocity import velocities_at
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_npz, write_json
 from splashbench.observe.grid import Grid
-from splashbench.scene.geometry import MAX_BYTES, STEPS_PER_VOXEL, SignedDistance
+from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles
 
 FORMAT = 2
-# phi is needed between frames only and matters within a few voxels of the interface: 1/16 voxel, up to +-7.9 voxels.
-PHI_STEPS_PER_VOXEL = STEPS_PER_VOXEL
 
 
 def _position_steps(grid: Grid) -> float:
@@ -44,7 +43,10 @@ def store_precision(carriers: Carriers, grid: Grid) -> Carriers:
 
 
 def pack_phi(phi: np.ndarray) -> np.ndarray:
-    """Signed distance in voxels to int8."""
+    """Signed distance in voxels to int8.
+
+    phi is needed between frames only and matters within a few voxels of the interface: 1/16 voxel, up to +-7.9 voxels.
+    """
     return SignedDistance.of(phi[None], np.zeros(3), 1.0).phi[0]
 
 
@@ -82,6 +84,11 @@ class Liquid:
         halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
         appearance = Appearance(halves[0], halves[1], appearance.decoder)
         return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance, carried)
+
+    @property
+    def track(self) -> Track:
+        """The carriers at any time."""
+        return Track(self.grid, self.carriers, self.velocities, self.factor, self.phi)
 
     def particles(self) -> Particles:
         """The carriers as particles, with the velocity of the liquid where they are, scene units per second.

@@ -18,6 +18,7 @@ from splashbench_methods.splashsplat.flip import FlipSolver, FlipTransport, grav
 from splashbench_methods.splashsplat.model import Liquid, pack_phi, store_precision
 from splashbench_methods.splashsplat.motion import gated, with_jet
 from splashbench_methods.splashsplat.occlusion import Occlusion
+from splashbench_methods.splashsplat.subframe import Track
 from splashbench_methods.splashsplat.survey import Survey, survey
 from splashbench_methods.splashsplat.targets import collect_targets
 from splashbench_methods.splashsplat.velocity import control_shape, fit_velocity
@@ -194,20 +195,20 @@ def fit_liquid(
     carriers = store_precision(carriers, grid)
     with run.stage("appearance"), one_torch_thread():
         appearance = initial_appearance(carriers.count, grid.voxel, config.optimisation, config.decoder, run.seed)
-        positions = [grid.to_scene(carriers.positions[carriers.rows(t)]) for t in range(carriers.n_frames)]
+        track = Track(grid, carriers, observations.velocities, factor, observations.packed)
         targets = collect_targets(
             scene,
             backgrounds,
-            positions,
+            track,
             config.silhouette_norm,
+            camera_times=config.camera_times,
             trusted=~observations.silhouettes.failed_masks,
             hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
         )
         if targets:
             fit_appearance(
                 appearance,
-                carriers,
-                grid,
+                track,
                 targets,
                 config.optimisation,
                 observations.hull_grid.voxel / grid.voxel,

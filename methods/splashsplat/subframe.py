@@ -1,27 +1,33 @@
 """The liquid at any time (paper, supplement, "Sub-frame decoding").
 
-Between frames t and t + 1 every carrier of frame t is advected by the fraction of the step with u_t, without
-correction or resampling, and phi is interpolated linearly between the two observations. What was learned stays as it
-is.
+Between two frames the carriers of the nearer one are advected by the fraction of the step, forwards or backwards, with
+the step's u_t, without correction or resampling, and phi is interpolated linearly between the two observations. What
+was learned stays as it is. (The paper goes forwards only; from the nearer frame the way is at most half a step, and a
+photograph taken a little before its frame's time is explained by that frame's own carriers.)
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
+from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import CarrierState
-from splashbench_methods.splashsplat.model import PHI_STEPS_PER_VOXEL, Liquid
 from splashbench_methods.splashsplat.transport import forecast
 from torch import Tensor
 
+from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
+from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 # Times nearer to a frame than this fraction of the step are that frame: JSON and the harness round seconds.
 _SAME_FRAME = 1e-4
 
 
 def locate(times: np.ndarray, time: float) -> tuple[int, float]:
-    """Frame t and fraction in [0, 1) of the step to t + 1 at which `time` lies, clamped to the sequence."""
+    """Frame nearest to `time`, and how far from it `time` lies, clamped to the sequence: a fraction of the step to the
+    next frame where it is positive, in (0, 0.5], of the step before where it is negative, in (-0.5, 0)."""
     times = np.asarray(times, dtype=np.float64)
     if len(times) == 1 or time <= times[0]:
         return 0, 0.0
@@ -33,20 +39,39 @@ def locate(times: np.ndarray, time: float) -> tuple[int, float]:
         return t, 0.0
     if fraction > 1 - _SAME_FRAME:
         return t + 1, 0.0
-    return t, fraction
+    return (t, fraction) if fraction <= 0.5 else (t + 1, fraction - 1)
 
 
-def state_at(liquid: Liquid, time: float) -> tuple[Tensor, CarrierState]:
-    """Carriers at `time` (seconds): their numbers, int64 [n], and the decoder's input."""
-    t, fraction = locate(liquid.times, time)
-    rows = liquid.carriers.rows(t)
-    positions, deformation = liquid.carriers.positions[rows], liquid.carriers.deformation[rows]
-    phi = liquid.carriers.phi[rows]
-    if fraction > 0 and len(positions):
-        control = liquid.velocities[t].astype(np.float32)
-        positions, deformation = forecast(control, liquid.factor, positions, deformation, fraction)
-        here, there = (sample(liquid.phi[frame], positions) / PHI_STEPS_PER_VOXEL for frame in (t, t + 1))
-        phi = ((1 - fraction) * here + fraction * there).astype(np.float32)
-    scene_positions = torch.from_numpy(liquid.grid.to_scene(positions).astype(np.float32))
-    state = CarrierState(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
-    return torch.from_numpy(liquid.carriers.ids[rows].astype(np.int64)), state
+@dataclass(frozen=True)
+class Track:
+    """Carriers and what moves them. velocities: [T - 1, cx, cy, cz, 3], voxels per frame, on a grid that is `factor`
+    times coarser than `grid`. phi: int8 [T, nx, ny, nz], see `model.pack_phi`."""
+
+    grid: Grid
+    carriers: Carriers
+    velocities: np.ndarray
+    factor: int
+    phi: np.ndarray
+
+    def ids(self, t: int) -> Tensor:
+        """Numbers of the carriers of frame `t`, int64 [n]."""
+        return torch.from_numpy(self.carriers.ids[self.carriers.rows(t)].astype(np.int64))
+
+    def state(self, t: int, fraction: float = 0.0) -> CarrierState:
+        """Decoder input of frame `t`'s carriers, a `fraction` in (-1, 1) of a step after the frame; see `locate`."""
+        rows = self.carriers.rows(t)
+        positions, deformation = self.carriers.positions[rows], self.carriers.deformation[rows]
+        phi = self.carriers.phi[rows]
+        if fraction != 0 and len(positions):
+            step, other = (t, t + 1) if fraction > 0 else (t - 1, t - 1)
+            control = self.velocities[step].astype(np.float32)
+            positions, deformation = forecast(control, self.factor, positions, deformation, fraction)
+            here, there = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
+            phi = ((1 - abs(fraction)) * here + abs(fraction) * there).astype(np.float32)
+        scene_positions = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))
+        return CarrierState(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
+
+    def at(self, times: np.ndarray, time: float) -> tuple[Tensor, CarrierState]:
+        """Carriers at `time` (seconds), the frames being at `times` [T]: their numbers and the decoder's input."""
+        t, fraction = locate(times, time)
+        return self.ids(t), self.state(t, fraction)

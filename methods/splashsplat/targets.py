@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from splashbench_methods.splashsplat.subframe import Track, locate
 from torch import Tensor
 
 from splashbench.render.window_loss import Photograph
@@ -20,18 +21,22 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
 MASK_MARGIN = 8
+# A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
+SAME_TIME = 0.01
 
 
 @dataclass
 class Target:
     """One time-camera pair.
 
-    camera: of the window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
+    frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
+    window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
     kept. background: float32 [h, w, 3] in [0, 1], a view of the camera's own. area: pixels over which the silhouette
     term averages. hidden: bool [n], carriers of the frame that the container hides from the view, or None.
     """
 
     frame: int
+    fraction: float
     camera: Camera
     eye: Tensor
     photograph: Photograph
@@ -76,17 +81,18 @@ def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) 
 def collect_targets(
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],
-    positions: list[np.ndarray],
+    track: Track,
     silhouette_norm: str,
+    camera_times: bool = False,
     trusted: np.ndarray | None = None,
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
 ) -> list[Target]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
-    backgrounds: float32 [H, W, 3] of each training view. positions: of the carriers of each frame [n, 3], scene
-    units. trusted: bool [T, V], by default all. hidden: given a view's name and positions [n, 3], which of them the
-    container hides (bool [n]). silhouette_norm: "image" averages the silhouette term over the view's sequence-wide
-    liquid window (the paper's images are such crops), "mask" over the mask.
+    backgrounds: float32 [H, W, 3] of each training view. camera_times: whether a photograph shows the liquid at its
+    camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name and
+    positions [n, 3], which of them the container hides (bool [n]). silhouette_norm: "image" averages the silhouette
+    term over the view's sequence-wide liquid window (the paper's images are such crops), "mask" over the mask.
     """
     targets = []
     for view, name in enumerate(scene.train):
@@ -98,11 +104,17 @@ def collect_targets(
         x0, y0, x1, y1 = _extent(ever, MASK_MARGIN)
         crop_area = float((x1 - x0) * (y1 - y0))
         eye = torch.tensor(camera.center, dtype=torch.float32)
+        taken = scene.camera_times[name] if camera_times else scene.times
         for t, mask in enumerate(masks):
-            if not mask.any() or len(positions[t]) == 0 or (trusted is not None and not trusted[t, view]):
+            if not mask.any() or (trusted is not None and not trusted[t, view]):
+                continue
+            frame, fraction = locate(scene.times, float(taken[t]))
+            fraction = fraction if abs(fraction) > SAME_TIME else 0.0
+            positions = track.state(frame, fraction).positions.numpy()
+            if len(positions) == 0:
                 continue
             box = _extent(mask, MASK_MARGIN)
-            x0, y0, x1, y1 = _window(camera, box, positions[t])
+            x0, y0, x1, y1 = _window(camera, box, positions)
             part = slice(box[1], box[3]), slice(box[0], box[2])
             photograph = Photograph(
                 torch.from_numpy(scene.image(name, t)[part].copy()),
@@ -112,13 +124,14 @@ def collect_targets(
             )
             targets.append(
                 Target(
-                    frame=t,
+                    frame=frame,
+                    fraction=fraction,
                     camera=camera.cropped(x0, y0, x1 - x0, y1 - y0),
                     eye=eye,
                     photograph=photograph,
                     background=torch.from_numpy(backgrounds[name])[y0:y1, x0:x1],
                     area=crop_area if silhouette_norm == "image" else float(mask.sum()),
-                    hidden=None if hidden is None else torch.from_numpy(hidden(name, positions[t])),
+                    hidden=None if hidden is None else torch.from_numpy(hidden(name, positions)),
                 )
             )
     return targets

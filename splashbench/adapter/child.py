@@ -125,7 +125,7 @@ def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
         report = _reporter(stream)
         for i, (camera, t) in enumerate(views):
             _reset_primitive_counter()
-            render = _checked(fitted.render(camera, float(scene.times[t])), camera, t)
+            render = _checked(fitted.render(camera, _time(scene, camera, t)), camera, t)
             counts.append(_primitive_count())
             write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
             if request.exr:
@@ -149,6 +149,11 @@ def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),
     )
+
+
+def _time(scene: TrainingScene, camera: Camera, t: int) -> float:
+    """When the photograph that the view is compared with was taken, seconds."""
+    return float(scene.camera_times[camera.name][t])
 
 
 def _checked(render: Render, camera: Camera, t: int) -> Render:
@@ -199,7 +204,7 @@ def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | No
         camera, t = cameras[i % len(cameras)], (i // len(cameras)) % scene.n_frames
         _synchronise()
         start = time.perf_counter()
-        fitted.render(camera, float(scene.times[t]))
+        fitted.render(camera, _time(scene, camera, t))
         _synchronise()
         if i >= WARM_UP_FRAMES:
             seconds.append(time.perf_counter() - start)

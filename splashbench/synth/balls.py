@@ -6,7 +6,7 @@ test wants is known. It is for trying a new method (CONTRIBUTING.md) and for the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,12 @@ _LIGHT = np.array([0.4, 0.8, 0.45]) / np.linalg.norm([0.4, 0.8, 0.45])
 
 
 def write_balls_scene(
-    directory: Path, size: tuple[int, int] = (96, 64), n_frames: int = 8, seed: int = 0, replace: bool = False
+    directory: Path,
+    size: tuple[int, int] = (96, 64),
+    n_frames: int = 8,
+    seed: int = 0,
+    delays: Mapping[str, float] | None = None,
+    replace: bool = False,
 ) -> Scene:
     """Write the scene and return it. Lengths are metres, y points up, steps are uneven as in real captures.
 
@@ -37,13 +42,16 @@ def write_balls_scene(
         size: (width, height) of the images in pixels.
         n_frames: timesteps within a third of a second.
         seed: of the particles' places within the balls and the unevenness of the steps.
+        delays: seconds after each timestep at which the named cameras, "1" to "7", expose; 0 for the others.
     """
     rng = np.random.default_rng(seed)
     times = np.linspace(0.0, 0.33, n_frames) + np.where(np.arange(n_frames) % 2, 0.25, 0.0) * 0.33 / n_frames
     cameras = {str(i + 1): _camera(str(i + 1), place, size) for i, place in enumerate(_ARC_PLACES)}
+    exposed = {name: times + (delays or {}).get(name, 0.0) for name in cameras}
     meta = SceneMeta(
         name="balls",
         times=times.tolist(),
+        camera_times={name: own.tolist() for name, own in exposed.items()} if delays else None,
         metres_per_unit=1.0,
         gravity=(0.0, -1.0, 0.0),
         provenance={"made_by": "splashbench.synth.balls", "seed": seed, "particle_radius": _PARTICLE_RADIUS},
@@ -55,7 +63,7 @@ def write_balls_scene(
             train=_TRAIN,
             test=_TEST,
             n_frames=n_frames,
-            frames=_frames(cameras, times),
+            frames=_frames(cameras, exposed),
             meta=meta,
             initial_points=_floor_points(),
         )
@@ -100,10 +108,10 @@ def _camera(name: str, place: int, size: tuple[int, int]) -> Camera:
 
 
 def _frames(
-    cameras: dict[str, Camera], times: NDArray[np.float64]
+    cameras: dict[str, Camera], times: dict[str, NDArray[np.float64]]
 ) -> Iterator[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_]]]:
     for name, camera in cameras.items():
-        for t, time in enumerate(times):
+        for t, time in enumerate(times[name]):
             yield name, t, *_render(camera, ball_centers(time))
 
 

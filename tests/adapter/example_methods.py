@@ -156,3 +156,21 @@ class Integers(Good):
 
         fitted.render = render  # type: ignore[method-assign]
         return fitted
+
+
+class Clock(Good):
+    """Its blue is the time it is asked for, in seconds."""
+
+    id = "clock"
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        return _Clock(config.blue, scene.n_frames)
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        return _Clock(0.0, scene.n_frames)
+
+
+class _Clock(_Flat):
+    def render(self, camera: Camera, time: float) -> Render:
+        self.blue = time
+        return super().render(camera, time)

@@ -12,6 +12,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_json
 from splashbench.scene import Scene
 from splashbench.submission import Status, Submission, check_submission
+from splashbench.synth.balls import write_balls_scene
 
 METHODS = Path(__file__).with_name("example_methods.py")
 
@@ -40,6 +41,14 @@ def test_a_good_method_is_measured_and_whole(balls_directory: Path, balls: Scene
     assert rendering.shape == (64, 96, 3)
     assert (rendering == [0, 0, 255]).all()
     np.testing.assert_allclose(submission.alpha("7", 0), 128 / 255)
+
+
+def test_views_are_rendered_when_their_photographs_were_taken(tmp_path: Path) -> None:
+    scene = write_balls_scene(tmp_path / "late", delays={"7": 0.5})
+    submission = _run("Clock", scene.directory, tmp_path / "out")
+    for t in (0, 3, scene.n_frames - 1):
+        for name, delay in (("6", 0.0), ("7", 0.5)):
+            np.testing.assert_allclose(submission.rendering(name, t)[..., 2] / 255, scene.times[t] + delay, atol=2e-3)
 
 
 @pytest.mark.parametrize(

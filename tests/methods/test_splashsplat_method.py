@@ -12,12 +12,12 @@ import torch
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.reconstruct import fit_liquid
-from splashbench_methods.splashsplat.subframe import locate, state_at
+from splashbench_methods.splashsplat.subframe import locate
 from splashbench_methods.splashsplat.transport import forecast
 
 from splashbench.adapter.contract import Run
 from splashbench.scene import Scene
-from splashbench.synth.balls import ball_centers
+from splashbench.synth.balls import ball_centers, write_balls_scene
 
 TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
 
@@ -122,23 +122,72 @@ def test_particle_velocities_are_seconds_not_frames(balls: Scene, fitted: Fitted
 def test_between_frames_carriers_move_on_and_appearance_stays(balls: Scene, fitted: FittedSplashSplat):
     liquid = fitted.liquid
     start, stop = liquid.times[2], liquid.times[3]
-    ids, before = state_at(liquid, start)
-    later_ids, halfway = state_at(liquid, 0.5 * (start + stop))
-    _, later = state_at(liquid, 0.1 * start + 0.9 * stop)
-    assert torch.equal(ids, later_ids)
-    half, most = ((s.positions - before.positions).norm(dim=1) for s in (halfway, later))
-    assert float(half.mean()) > 0
-    assert float((most / half.clamp_min(1e-6)).median()) == pytest.approx(1.8, abs=0.1)
-    exact, _ = state_at(liquid, float(stop) + 1e-9)
+
+    def at(share: float) -> tuple[torch.Tensor, torch.Tensor]:
+        ids, state = liquid.track.at(liquid.times, (1 - share) * start + share * stop)
+        return ids, state.positions
+
+    ids, before = at(0)
+    for near, far in ((0.25, 0.5), (0.8, 0.6)):  # from the frame before, and back from the one after
+        whose, exact = (ids, before) if near < 0.5 else at(1)
+        moved = [(at(share)[1] - exact).norm(dim=1) for share in (near, far)]
+        assert all(torch.equal(at(share)[0], whose) for share in (near, far))
+        assert float(moved[0].mean()) > 0
+        assert float((moved[1] / moved[0].clamp_min(1e-6)).median()) == pytest.approx(2, abs=0.15)
+    exact, _ = liquid.track.at(liquid.times, float(stop) + 1e-9)
     np.testing.assert_array_equal(exact, liquid.carriers.ids[liquid.carriers.rows(3)])
+
+
+def test_either_side_of_the_middle_of_a_step_is_the_same_place(balls: Scene, fitted: FittedSplashSplat):
+    """Carriers that live through the step are nearly where both frames say, against what they move in it."""
+    liquid = fitted.liquid
+    step = liquid.times[5] - liquid.times[4]
+    (ids, here), (after, there) = (liquid.track.at(liquid.times, liquid.times[4] + f * step) for f in (0.49, 0.51))
+    _, mine, theirs = np.intersect1d(ids.numpy(), after.numpy(), return_indices=True)
+    gap = (here.positions[mine] - there.positions[theirs]).norm(dim=1)
+    way = (liquid.track.state(5).positions[theirs] - liquid.track.state(4).positions[mine]).norm(dim=1)
+    assert len(mine) > 100
+    assert float(gap.median()) < 0.25 * float(way.median())
 
 
 @pytest.mark.parametrize(
     ("time", "frame", "fraction"),
-    [(-1, 0, 0), (0, 0, 0), (0.25, 0, 0.25), (1.0000001, 1, 0), (2.0, 1, 0.5), (2.9999999, 2, 0), (9, 2, 0)],
+    [
+        (-1, 0, 0),
+        (0, 0, 0),
+        (0.25, 0, 0.25),
+        (0.75, 1, -0.25),
+        (1.0000001, 1, 0),
+        (2.0, 1, 0.5),
+        (2.5, 2, -0.25),
+        (2.9999999, 2, 0),
+        (9, 2, 0),
+    ],
 )
 def test_times_are_located_on_uneven_steps(time, frame, fraction):
     assert locate(np.array([0.0, 1.0, 3.0]), time) == (frame, pytest.approx(fraction))
+
+
+def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(tmp_path: Path):
+    """Three of five cameras expose up to half a step early or late; the test views are in time."""
+    n_frames = 6
+    step = 0.33 / (n_frames - 1)
+    delays = {"1": -0.4 * step, "3": 0.45 * step, "5": -0.3 * step}
+    scene = write_balls_scene(tmp_path / "late", n_frames=n_frames, delays=delays)
+    psnr = {}
+    for camera_times in (True, False):
+        config = SplashSplatConfig.preset("quick", TINY | {"camera_times": camera_times})
+        fitted = SplashSplat().fit(scene.training(), config, Run(seed=1))
+        for views in (tuple(delays), scene.test):
+            values = []
+            for name in views:
+                for t in range(1, n_frames - 1):
+                    mask = scene.mask(name, t)
+                    render = fitted.render(scene.cameras[name], float(scene.camera_times[name][t]))
+                    values.append(-10 * np.log10(((render.rgb - scene.image(name, t) / 255)[mask] ** 2).mean()))
+            psnr[camera_times, views] = np.mean(values)
+    assert psnr[True, tuple(delays)] > psnr[False, tuple(delays)] + 0.7
+    assert psnr[True, scene.test] > psnr[False, scene.test] + 0.2
 
 
 def test_the_same_seed_gives_the_same_liquid_bit_for_bit(balls: Scene):
