@@ -69,10 +69,13 @@ class SplashSplatConfig(MethodConfig):
     base_scale: PositiveFloat = 0.35
     # Optimisation
     iterations: int = Field(2000, ge=0)
-    learning_rate_features: PositiveFloat = 1e-2
-    learning_rate_heads: PositiveFloat = 5e-3
+    learning_rate_features: PositiveFloat = 0.1
+    learning_rate_heads: PositiveFloat = 0.015
     learning_rate_scales: PositiveFloat = 1e-2
     anneal: bool = True
+    #: of the photographs, withheld to tell when to stop before `iterations`; 0 never stops before
+    withheld_share: float = Field(0.04, ge=0, le=0.1)
+    stop_gain: float = Field(0.01, ge=0, lt=1)
     ssim_every: PositiveInt = 1
     silhouette_norm: Literal["image", "mask"] = "image"
     foreground_weight: float = Field(0.5, ge=0)
@@ -112,6 +115,7 @@ class SplashSplatConfig(MethodConfig):
             "learning_rate_heads": 2e-3,
             "learning_rate_scales": 2e-3,
             "anneal": False,
+            "withheld_share": 0.0,
             "prune_opacity": 0.0,
             "background_preset": "paper",
         },
@@ -177,6 +181,8 @@ class SplashSplatConfig(MethodConfig):
             learning_rate_heads=self.learning_rate_heads,
             learning_rate_scales=self.learning_rate_scales,
             anneal=self.anneal,
+            withheld_share=self.withheld_share,
+            stop_gain=self.stop_gain,
             ssim_every=self.ssim_every,
             base_scale=self.base_scale,
             weights=LossWeights(

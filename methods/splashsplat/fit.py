@@ -23,6 +23,7 @@ from splashbench_methods.splashsplat.decoder import (
     initial_log_scale,
 )
 from splashbench_methods.splashsplat.optimizer import RowAdam
+from splashbench_methods.splashsplat.schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
 from splashbench_methods.splashsplat.subframe import Track
 from splashbench_methods.splashsplat.targets import Target
 from torch import Tensor
@@ -32,18 +33,26 @@ from splashbench.render import rasterize
 from splashbench.render.window_loss import window_losses
 from splashbench.scene.camera import Camera
 
+# Iterations between two looks at the withheld photographs.
+_LOOK_EVERY = 100
+# Iterations in which the learning rates fall, as a share of those before.
+_FALL = 0.5
+
 
 @dataclass(frozen=True)
 class FitSettings:
     """Settings of the optimisation.
 
-    ssim_every: the SSIM term enters every so many iterations, weighted up by as much.
-    anneal: whether the learning rates fall along a half cosine.
+    iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
+    anneal: whether the learning rates fall along a half cosine. withheld_share: of the photographs, withheld to tell
+    when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see `AdaptiveSchedule`.
     """
 
     iterations: int = 1000
-    learning_rate_features: float = 5e-3
-    learning_rate_heads: float = 5e-3
+    withheld_share: float = 0.0
+    stop_gain: float = 0.01
+    learning_rate_features: float = 0.1
+    learning_rate_heads: float = 0.015
     learning_rate_scales: float = 1e-2
     anneal: bool = True
     ssim_every: int = 1
@@ -86,25 +95,23 @@ def composite(children: Children, camera: Camera, background: Tensor) -> tuple[T
     return image, alpha
 
 
-def total_loss(
-    penalties: Penalties,
-    image: Tensor,
-    alpha: Tensor,
-    target: Target,
-    voxel: float,
-    weights: losses.LossWeights,
-    ssim_weight: float,
-) -> Tensor:
-    """The weighted sum of all terms (Eq. total_loss); `ssim_weight` replaces weights.ssim."""
+def image_loss(image: Tensor, alpha: Tensor, target: Target, weights: losses.LossWeights, ssim_weight: float) -> Tensor:
+    """The weighted sum of the terms that compare images (Eq. total_loss); `ssim_weight` replaces weights.ssim."""
     foreground, gradient, silhouette = window_losses(image, alpha, target.photograph)
     loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / target.area
     if ssim_weight > 0:
         truth = target.photograph.image.to(torch.float32) / 255
         loss = loss + ssim_weight * losses.ssim_loss(image[target.photograph.box], truth)
-    loss = loss + weights.covariance * penalties.covariance / voxel**2
-    loss = loss + weights.separation * penalties.separation
-    loss = loss + weights.colour * penalties.colour
     return loss
+
+
+def penalty_loss(penalties: Penalties, voxel: float, weights: losses.LossWeights) -> Tensor:
+    """The weighted sum of the other terms."""
+    return (
+        weights.covariance * penalties.covariance / voxel**2
+        + weights.separation * penalties.separation
+        + weights.colour * penalties.colour
+    )
 
 
 def _colour_cells(track: Track, t: int, size: float) -> ColourCells:
@@ -137,21 +144,48 @@ def fit_appearance(
     rates = (settings.learning_rate_features, settings.learning_rate_scales)
     tables = [RowAdam(table.requires_grad_(), rate) for table, rate in zip((features, log_scales), rates)]
     rng = np.random.default_rng([seed, 1])
-    queue: list[int] = []
-    history: list[float] = []
-    for iteration in range(settings.iterations):
-        if not queue:
-            queue = rng.permutation(len(targets)).tolist()
-        target = targets[queue.pop()]
-        active = ids[target.frame]
-        # Kept for the frames alone: one for every photograph would be a gigabyte on large scenes.
+    held = np.zeros(len(targets), dtype=bool)
+    if settings.withheld_share > 0:
+        held = withheld(len(targets), settings.withheld_share, np.random.default_rng([seed, 3]))
+    schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
+    if held.any():
+        schedule = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+
+    def seen(target: Target, penalised: bool) -> tuple[Tensor, Tensor, Penalties | None]:
+        # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
         state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
         state = replace(state, visibility=target.visibility)
-        children, penalties = decoder.decode(features, log_scales, active, state, target.eye, cells[target.frame])
-        image, alpha = composite(children, target.camera, target.background)
+        of_cells = cells[target.frame] if penalised else None
+        children, found = decoder.decode(features, log_scales, ids[target.frame], state, target.eye, of_cells)
+        return *composite(children, target.camera, target.background), found
+
+    @torch.no_grad()
+    def loss_of_withheld() -> float:
+        weights, total = settings.weights, 0.0
+        for number in np.nonzero(held)[0]:
+            image, alpha, _ = seen(targets[number], penalised=False)
+            total += float(image_loss(image, alpha, targets[number], weights, weights.ssim))
+        return total / int(held.sum())
+
+    queue: list[int] = []
+    history: list[float] = []
+    iteration = 0
+    while True:
+        if isinstance(schedule, AdaptiveSchedule) and schedule.due(iteration):
+            schedule.look(iteration, loss_of_withheld())
+        factor = schedule.factor(iteration)
+        if factor is None:
+            break
+        if not queue:
+            open_to_fit = np.ones(len(targets), dtype=bool) if _all_are_open(schedule) else ~held
+            queue = rng.permutation(np.nonzero(open_to_fit)[0]).tolist()
+        target = targets[queue.pop()]
+        image, alpha, found = seen(target, penalised=True)
+        assert found is not None
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
-        loss = total_loss(penalties, image, alpha, target, track.grid.voxel, settings.weights, ssim_weight)
+        loss = image_loss(image, alpha, target, settings.weights, ssim_weight)
+        loss = loss + penalty_loss(found, track.grid.voxel, settings.weights)
         history.append(float(loss.detach()))
         if not math.isfinite(history[-1]):
             raise SplashbenchError(
@@ -159,18 +193,21 @@ def fit_appearance(
             )
         gradients = torch.autograd.grad(loss, [features, log_scales, *parameters])
         by_table, by_head = gradients[:2], gradients[2:]
-        factor = 1.0
-        if settings.anneal:
-            factor = 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * iteration / settings.iterations))
         for parameter, gradient in zip(parameters, by_head):
             parameter.grad = gradient
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
         for table, gradient in zip(tables, by_table):
-            table.step(active, gradient.coalesce().values(), factor)
-        progress((iteration + 1) / settings.iterations)
+            table.step(ids[target.frame], gradient.coalesce().values(), factor)
+        iteration += 1
+        progress(schedule.done(iteration))
     return history
+
+
+def _all_are_open(schedule: Schedule) -> bool:
+    """Whether withheld photographs are fitted as well: once they have said when to end."""
+    return not isinstance(schedule, AdaptiveSchedule) or schedule.turned
 
 
 @torch.no_grad()

@@ -1,0 +1,100 @@
+"""How long the appearance is fitted, and how the learning rates fall meanwhile.
+
+A fixed schedule runs all its iterations, at full rates (the paper) or down a half cosine. An adaptive one keeps the
+rates up while photographs that it withholds from the fit still get better explained, and brings them down once they do
+not: a scene gets as many iterations as it can use.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+# Of the full rates, at the end.
+LOWEST = 0.02
+
+
+def _cosine(done: float) -> float:
+    """Factor of the rates after the share `done` of their fall."""
+    return LOWEST + (1 - LOWEST) * 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+
+
+class Schedule(Protocol):
+    """What the fit asks before every iteration, counted from 0."""
+
+    def factor(self, iteration: int) -> float | None:
+        """By how much the learning rates are multiplied; None where the fit is over."""
+
+    def done(self, iteration: int) -> float:
+        """Share of the fit that lies behind, for the progress bar."""
+
+
+@dataclass(frozen=True)
+class FixedSchedule:
+    """`iterations`, at constant rates or down a half cosine."""
+
+    iterations: int
+    anneal: bool
+
+    def factor(self, iteration: int) -> float | None:
+        if iteration >= self.iterations:
+            return None
+        return _cosine(iteration / self.iterations) if self.anneal else 1.0
+
+    def done(self, iteration: int) -> float:
+        return iteration / self.iterations
+
+
+class AdaptiveSchedule:
+    """Full rates until withheld photographs stop gaining, then a half cosine over a share of the iterations so far.
+
+    limit: iterations at most, both parts together. every: iterations between two looks at the withheld photographs.
+    gain: by what share their loss has to fall over one look and the one before, taken together, to go on. fall: length
+    of the second part, as a share of the first.
+    """
+
+    def __init__(self, limit: int, every: int, gain: float, fall: float) -> None:
+        self.limit, self.every, self.gain, self.fall = limit, every, gain, fall
+        self.losses: list[float] = []
+        self._turn = max(1, int(limit / (1 + fall)))
+        self._turned = False
+
+    @property
+    def turned(self) -> bool:
+        """Whether the rates are falling: nothing is withheld any more."""
+        return self._turned
+
+    def due(self, iteration: int) -> bool:
+        """Whether the withheld photographs are to be looked at before this iteration."""
+        return not self._turned and iteration > 0 and iteration % self.every == 0
+
+    def look(self, iteration: int, loss: float) -> None:
+        """Take note of the withheld photographs' mean loss before this iteration."""
+        self.losses.append(loss)
+        # Over two looks: one alone is as noisy as what it should tell.
+        if len(self.losses) > 2 and loss > (1 - self.gain) * self.losses[-3]:
+            self._turn = min(self._turn, iteration)
+
+    def factor(self, iteration: int) -> float | None:
+        self._turned = iteration >= self._turn
+        if not self._turned:
+            return 1.0
+        length = max(1.0, self.fall * self._turn)
+        done = (iteration - self._turn) / length
+        return None if done >= 1 or iteration >= self.limit else _cosine(done)
+
+    def done(self, iteration: int) -> float:
+        return min(1.0, iteration / ((1 + self.fall) * self._turn))
+
+
+def withheld(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Which of `count` photographs are withheld, bool [count]: `share` of them, at least 8; none where that would be
+    more than a tenth."""
+    chosen = np.zeros(count, dtype=bool)
+    number = max(8, round(share * count))
+    if number <= count / 10:
+        chosen[rng.choice(count, number, replace=False)] = True
+    return chosen

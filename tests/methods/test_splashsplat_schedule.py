@@ -1,0 +1,128 @@
+"""How long the fit goes on: fixed schedules, and the one that looks at withheld photographs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from splashbench_methods.splashsplat import fit
+from splashbench_methods.splashsplat.config import SplashSplatConfig
+from splashbench_methods.splashsplat.reconstruct import fit_liquid
+from splashbench_methods.splashsplat.schedule import LOWEST, AdaptiveSchedule, FixedSchedule, Schedule, withheld
+
+from splashbench.adapter.contract import Run
+from splashbench.scene import Scene
+from splashbench.synth.balls import write_balls_scene
+
+TINY = {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "ssim_every": 4}
+
+
+def factors(schedule: Schedule, losses: dict[int, float] | None = None) -> list[float]:
+    """The factors of a whole run, in which the withheld photographs have the loss `losses` gives for the iteration."""
+    found: list[float] = []
+    while True:
+        if isinstance(schedule, AdaptiveSchedule) and schedule.due(len(found)):
+            assert losses is not None
+            schedule.look(len(found), losses[len(found)])
+        factor = schedule.factor(len(found))
+        if factor is None:
+            return found
+        assert 0 <= schedule.done(len(found)) < 1
+        found.append(factor)
+
+
+def adaptive(limit: int = 900) -> AdaptiveSchedule:
+    return AdaptiveSchedule(limit, every=100, gain=0.01, fall=0.5)
+
+
+def test_a_fixed_schedule_runs_all_its_iterations():
+    assert factors(FixedSchedule(5, anneal=False)) == [1.0] * 5
+    falling = factors(FixedSchedule(200, anneal=True))
+    assert len(falling) == 200
+    assert falling[0] == 1
+    assert falling[100] == pytest.approx((1 + LOWEST) / 2)
+    assert falling[-1] == pytest.approx(LOWEST, abs=1e-3)
+    assert (np.diff(falling) < 0).all()
+    assert factors(FixedSchedule(0, anneal=True)) == []
+
+
+def test_rates_stay_up_to_the_limit_while_withheld_photographs_gain():
+    found = factors(adaptive(), {i: 0.9**i for i in range(100, 900, 100)})
+    assert len(found) == 900
+    assert found[:600] == [1.0] * 600
+    assert (np.diff(found[599:]) <= 0).all()
+    assert found[-1] == pytest.approx(LOWEST, abs=1e-3)
+
+
+def test_the_fit_ends_soon_after_withheld_photographs_stop_gaining():
+    losses = {100: 1.0, 200: 0.8, 300: 0.795, 400: 0.793, 500: 0.5}
+    found = factors(adaptive(), losses)  # 0.793 against 0.8, two looks before: 0.9 %
+    assert len(found) == 600
+    assert found[399] == 1 > found[401]
+
+
+def test_one_bad_look_does_not_end_the_fit():
+    losses = {100: 1.0, 200: 0.8, 300: 0.85, 400: 0.7, 500: 0.71, 600: 0.6}
+    assert len(factors(adaptive(), losses)) == 900
+
+
+def test_some_photographs_are_withheld_where_there_are_enough():
+    for count, expected in ((20, 0), (79, 0), (80, 8), (250, 10), (1000, 40)):
+        assert withheld(count, 0.04, np.random.default_rng(0)).sum() == expected
+
+
+@pytest.fixture(scope="module")
+def many_balls(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """A scene with enough photographs to withhold some."""
+    return write_balls_scene(tmp_path_factory.mktemp("scenes") / "balls", size=(48, 32), n_frames=20)
+
+
+def fitted(scene: Scene, **overrides: object) -> list[float]:
+    """The progress of a fit on grey backgrounds, iteration by iteration."""
+    training = scene.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+    config = SplashSplatConfig.preset("quick", TINY | overrides)
+    told: list[float] = []
+
+    def note(fraction: float, message: str) -> None:
+        if message == "appearance":
+            told.append(fraction)
+
+    fit_liquid(training, grey, config, Run(seed=1, _report=note))
+    return told
+
+
+def test_a_scene_that_is_soon_explained_is_soon_fitted(many_balls: Scene, monkeypatch: pytest.MonkeyPatch):
+    looks: list[tuple[int, float]] = []
+    look = AdaptiveSchedule.look
+
+    def note(self: AdaptiveSchedule, iteration: int, loss: float) -> None:
+        look(self, iteration, loss)
+        looks.append((iteration, loss))
+
+    monkeypatch.setattr(AdaptiveSchedule, "look", note)
+    monkeypatch.setattr(fit, "_LOOK_EVERY", 20)
+    few = fitted(many_balls, iterations=600, withheld_share=0.1, stop_gain=0.2)
+    assert len(looks) >= 3
+    assert looks[-1][1] < 0.9 * looks[0][1]  # what is withheld is explained better and better
+    assert len(few) == looks[-1][0] * 1.5  # and the rates fall from the last look on
+    assert len(few) < 500
+    assert few[-1] == pytest.approx(1)
+    assert len(fitted(many_balls, iterations=60, withheld_share=0.0)) == 60
+
+
+def test_withheld_photographs_are_fitted_once_the_rates_fall(many_balls: Scene, monkeypatch: pytest.MonkeyPatch):
+    """All photographs but the withheld ones in the first part, all of them in the second."""
+    seen: list[int] = []
+    monkeypatch.setattr(fit, "_LOOK_EVERY", 1000)
+    real = fit.image_loss
+
+    def note(image, alpha, target, *others):
+        seen.append(id(target))
+        return real(image, alpha, target, *others)
+
+    monkeypatch.setattr(fit, "image_loss", note)
+    fitted(many_balls, iterations=450, withheld_share=0.1)
+    first, second = set(seen[:300]), set(seen[300:])
+    everything = len(first | second)
+    assert len(first) == everything - len(second - first)
+    assert 0.08 * everything <= len(second - first) <= 0.1 * everything + 1
