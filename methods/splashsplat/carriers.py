@@ -23,7 +23,8 @@ Variant = Literal["full", "no_resampling", "per_frame", "flip"]
 
 @dataclass(frozen=True)
 class CarrierSettings:
-    """Distances in transport voxels. `variant` picks the paper's ablations; "full" is the method.
+    """Distances in transport voxels. lifetime: frames that a carrier lasts on average, None for as long as it stays in
+    the liquid; a new one takes its place, which has its own appearance to learn. `variant` picks the paper's ablations; "full" is the method.
 
     "no_resampling": carriers of the first liquid only. "per_frame": new ones in every frame, none moved. "flip":
     carriers of the first liquid, moved by a simulation that looks at no other frame (flip.py).
@@ -34,6 +35,7 @@ class CarrierSettings:
     kill_outside: float = 0.5
     kill_inside: float | None = -3.0
     cell_capacity: int | None = 4
+    lifetime: int | None = None
     shell: ShellSettings = field(default_factory=ShellSettings)
 
 
@@ -122,6 +124,7 @@ def track_carriers(
     ids = np.zeros(0, dtype=np.int32)
     x = np.zeros((0, 3), dtype=np.float32)
     F = np.zeros((0, 3, 3), dtype=np.float32)
+    lasts = np.zeros(0, dtype=np.int64)  # of every carrier so far, the last frame it may see
     born = 0
     simulated: Simulation | None = None
     frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
@@ -138,7 +141,7 @@ def track_carriers(
             if landed is not None:
                 x = landed(t, start, x)
             x = correct(phi, x, float(ratio), settings.correction)
-            alive = _alive(phi, x, ratio, settings)
+            alive = _alive(phi, x, ratio, settings) & (lasts[ids] >= t)
             if settings.cell_capacity is not None:
                 alive[alive] = within_capacity(cell_of(x[alive], grid), ids[alive], settings.cell_capacity)
             ids, x, F = ids[alive], x[alive], F[alive]
@@ -150,6 +153,7 @@ def track_carriers(
             ids = np.concatenate([ids, np.arange(born, born + len(new), dtype=np.int32)])
             x = np.concatenate([x, new])
             F = np.concatenate([F, np.broadcast_to(np.eye(3, dtype=np.float32), (len(new), 3, 3))])
+            lasts = np.concatenate([lasts, t + _ages(len(new), settings.lifetime, np.random.default_rng([seed, t, 1]))])
             born += len(new)
             if simulation is not None and settings.variant == "flip" and born:
                 simulated = simulation(phi, ids, x)
@@ -157,6 +161,14 @@ def track_carriers(
     starts = np.concatenate([[0], np.cumsum([len(frame[0]) for frame in frames])]).astype(np.int64)
     all_ids, positions, deformation, depth = (np.concatenate(column) for column in zip(*frames))
     return Carriers(starts, all_ids, positions, deformation, depth, born)
+
+
+def _ages(count: int, lifetime: int | None, rng: np.random.Generator) -> np.ndarray:
+    """How many frames after its first each of `count` new carriers may last, int64 [count]; spread, so that those of
+    one frame do not all go in one frame."""
+    if lifetime is None:
+        return np.full(count, np.iinfo(np.int32).max, dtype=np.int64)
+    return rng.integers(0, 2 * lifetime - 1, count)
 
 
 def _alive(phi: np.ndarray, x: np.ndarray, ratio: np.float32, settings: CarrierSettings) -> np.ndarray:

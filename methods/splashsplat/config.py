@@ -58,6 +58,8 @@ class SplashSplatConfig(MethodConfig):
     kill_outside: PositiveFloat = 0.5
     kill_inside: float | None = Field(-3.0, lt=0)
     cell_capacity: PositiveInt | None = 6
+    #: frames that a carrier lasts on average; None for as long as it stays in the liquid
+    lifetime: PositiveInt | None = 2
     shell_depth: PositiveFloat = 1.5
     min_per_cell: PositiveInt = 2
     max_per_cell: PositiveInt = 4
@@ -107,6 +109,7 @@ class SplashSplatConfig(MethodConfig):
             "velocity_smooth": "field",
             "kill_inside": None,
             "cell_capacity": None,
+            "lifetime": None,
             "shell_depth": 3.0,
             "max_per_cell": 5,
             "base_scale": 0.7,
@@ -162,6 +165,7 @@ class SplashSplatConfig(MethodConfig):
             kill_outside=self.kill_outside,
             kill_inside=self.kill_inside,
             cell_capacity=self.cell_capacity,
+            lifetime=self.lifetime,
             shell=ShellSettings(
                 depth=self.shell_depth,
                 min_per_cell=self.min_per_cell,

@@ -209,6 +209,29 @@ def test_carriers_live_on_with_the_flow():
     np.testing.assert_allclose(carriers.deformation, np.broadcast_to(np.eye(3), carriers.deformation.shape), atol=1e-4)
 
 
+@pytest.mark.parametrize("lifetime", [1, 2, 4])
+def test_carriers_are_replaced_when_their_time_is_up(lifetime: int):
+    """Of liquid at rest every carrier would stay; they last as long as they are let, and others take their places."""
+    carriers = track([ball((20, 20, 20))] * 13, lifetime=lifetime)
+    births, ends = carriers.births_and_ends()
+    frames = ends - births + 1
+    within = births <= 12 - 2 * lifetime  # the sequence does not cut these short
+    assert frames.max() == 2 * lifetime - 1
+    assert frames[within].mean() == pytest.approx(lifetime, rel=0.03)
+    counts = np.diff(carriers.starts)
+    assert counts.min() > 0.9 * counts.max()  # cells that the shell grazes fill up by and by
+    # Spread: those of one frame do not go together, though they came together.
+    gone = np.bincount(ends + 1, minlength=13)[1:12]
+    assert gone.max() < 1.6 * counts.mean() / lifetime
+
+
+def test_who_lives_one_frame_is_made_anew_in_every_one():
+    fields = [ball((16 + t, 20, 20)) for t in range(3)]
+    short, anew = track(fields, lifetime=1), track(fields, variant="per_frame")
+    np.testing.assert_array_equal(short.ids, anew.ids)
+    np.testing.assert_array_equal(short.positions, anew.positions)
+
+
 def test_the_loop_starts_when_liquid_appears_and_survives_an_empty_frame():
     nothing = np.full((SIZE,) * 3, 20, dtype=np.float32)
     carriers = track([nothing, ball((20, 20, 20)), nothing, ball((20, 20, 20))])
