@@ -2,7 +2,7 @@
 
 Each new observation removes what drifted out of the liquid and refills the shell below its surface. Two bounds the
 paper does not mention keep the population finite: crowded cells keep their oldest carriers only, and carriers that
-sank below the shell are dropped.
+sank below the shell are dropped. A third, by choice, keeps appearance up to date: a carrier lasts a few frames.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ Variant = Literal["full", "no_resampling", "per_frame", "flip"]
 
 @dataclass(frozen=True)
 class CarrierSettings:
-    """Distances in transport voxels. lifetime: frames that a carrier lasts on average, None for as long as it stays in
-    the liquid; a new one takes its place, which has its own appearance to learn. `variant` picks the paper's ablations; "full" is the method.
+    """Distances in transport voxels.
 
-    "no_resampling": carriers of the first liquid only. "per_frame": new ones in every frame, none moved. "flip":
-    carriers of the first liquid, moved by a simulation that looks at no other frame (flip.py).
+    lifetime: frames that a carrier lasts on average, None for as long as it stays in the liquid. A new one takes its
+    place and has its own appearance to learn: what a carrier shows, and whether it is of the liquid at all or of the
+    phantom volume of the hull, changes within a few frames. `variant` picks the paper's ablations; "full" is the
+    method. "no_resampling": carriers of the first liquid only. "per_frame": new ones in every frame, none moved.
+    "flip": carriers of the first liquid, moved by a simulation that looks at no other frame (flip.py).
     """
 
     variant: Variant = "full"
