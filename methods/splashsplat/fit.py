@@ -171,14 +171,14 @@ def fit_appearance(
     history: list[float] = []
     iteration = 0
     while True:
-        if isinstance(schedule, AdaptiveSchedule) and schedule.due(iteration):
+        if schedule.due(iteration):
             schedule.look(iteration, loss_of_withheld())
         factor = schedule.factor(iteration)
         if factor is None:
             break
         if not queue:
-            open_to_fit = np.ones(len(targets), dtype=bool) if _all_are_open(schedule) else ~held
-            queue = rng.permutation(np.nonzero(open_to_fit)[0]).tolist()
+            fitted = np.nonzero(~held)[0] if schedule.withholds else np.arange(len(targets))
+            queue = rng.permutation(fitted).tolist()
         target = targets[queue.pop()]
         image, alpha, found = seen(target, penalised=True)
         assert found is not None
@@ -203,11 +203,6 @@ def fit_appearance(
         iteration += 1
         progress(schedule.done(iteration))
     return history
-
-
-def _all_are_open(schedule: Schedule) -> bool:
-    """Whether withheld photographs are fitted as well: once they have said when to end."""
-    return not isinstance(schedule, AdaptiveSchedule) or schedule.turned
 
 
 @torch.no_grad()

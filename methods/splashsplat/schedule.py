@@ -25,6 +25,16 @@ def _cosine(done: float) -> float:
 class Schedule(Protocol):
     """What the fit asks before every iteration, counted from 0."""
 
+    @property
+    def withholds(self) -> bool:
+        """Whether the withheld photographs are still to be left out of the fit."""
+
+    def due(self, iteration: int) -> bool:
+        """Whether the withheld photographs are to be looked at before this iteration."""
+
+    def look(self, iteration: int, loss: float) -> None:
+        """Take note of the withheld photographs' mean loss before this iteration."""
+
     def factor(self, iteration: int) -> float | None:
         """By how much the learning rates are multiplied; None where the fit is over."""
 
@@ -38,6 +48,13 @@ class FixedSchedule:
 
     iterations: int
     anneal: bool
+    withholds: bool = False
+
+    def due(self, iteration: int) -> bool:
+        return False
+
+    def look(self, iteration: int, loss: float) -> None:
+        raise AssertionError("a fixed schedule looks at nothing")
 
     def factor(self, iteration: int) -> float | None:
         if iteration >= self.iterations:
@@ -63,16 +80,13 @@ class AdaptiveSchedule:
         self._turned = False
 
     @property
-    def turned(self) -> bool:
-        """Whether the rates are falling: nothing is withheld any more."""
-        return self._turned
+    def withholds(self) -> bool:
+        return not self._turned
 
     def due(self, iteration: int) -> bool:
-        """Whether the withheld photographs are to be looked at before this iteration."""
         return not self._turned and iteration > 0 and iteration % self.every == 0
 
     def look(self, iteration: int, loss: float) -> None:
-        """Take note of the withheld photographs' mean loss before this iteration."""
         self.losses.append(loss)
         # Over two looks: one alone is as noisy as what it should tell.
         if len(self.losses) > 2 and loss > (1 - self.gain) * self.losses[-3]:

@@ -20,7 +20,7 @@ def factors(schedule: Schedule, losses: dict[int, float] | None = None) -> list[
     """The factors of a whole run, in which the withheld photographs have the loss `losses` gives for the iteration."""
     found: list[float] = []
     while True:
-        if isinstance(schedule, AdaptiveSchedule) and schedule.due(len(found)):
+        if schedule.due(len(found)):
             assert losses is not None
             schedule.look(len(found), losses[len(found)])
         factor = schedule.factor(len(found))
