@@ -580,8 +580,8 @@ def test_a_stopped_run_takes_its_method_along_and_can_be_run_again(
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"STARTED": str(started), "TMPDIR": str(tmp_path)},
-        # A test run that was started in the background ignores SIGINT, and so would this.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        # A test run that was started in the background, or by nohup, ignores these, and so would this.
+        preexec_fn=lambda: [signal.signal(each, signal.SIG_DFL) for each in (signal.SIGINT, signal.SIGHUP)],
     )
     for _ in range(300):
         if started.exists():
