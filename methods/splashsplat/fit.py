@@ -44,8 +44,9 @@ class FitSettings:
     """Settings of the optimisation.
 
     iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
-    anneal: whether the learning rates fall along a half cosine. withheld_share: of the photographs, withheld to tell
-    when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see `AdaptiveSchedule`.
+    anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. withheld_share: of the
+    photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
+    `AdaptiveSchedule`.
     """
 
     iterations: int = 1000

@@ -19,7 +19,7 @@ LOWEST = 0.02
 
 def _cosine(done: float) -> float:
     """Factor of the rates after the share `done` of their fall."""
-    return LOWEST + (1 - LOWEST) * 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+    return LOWEST + (1 - LOWEST) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 class Schedule(Protocol):
@@ -48,7 +48,10 @@ class FixedSchedule:
 
     iterations: int
     anneal: bool
-    withholds: bool = False
+
+    @property
+    def withholds(self) -> bool:
+        return False
 
     def due(self, iteration: int) -> bool:
         return False
@@ -76,7 +79,7 @@ class AdaptiveSchedule:
     def __init__(self, limit: int, every: int, gain: float, fall: float) -> None:
         self.limit, self.every, self.gain, self.fall = limit, every, gain, fall
         self.losses: list[float] = []
-        self._turn = max(1, int(limit / (1 + fall)))
+        self._turn = int(limit / (1 + fall))
         self._turned = False
 
     @property
@@ -93,15 +96,17 @@ class AdaptiveSchedule:
             self._turn = min(self._turn, iteration)
 
     def factor(self, iteration: int) -> float | None:
+        if iteration >= self._end:
+            return None
         self._turned = iteration >= self._turn
-        if not self._turned:
-            return 1.0
-        length = max(1.0, self.fall * self._turn)
-        done = (iteration - self._turn) / length
-        return None if done >= 1 or iteration >= self.limit else _cosine(done)
+        return _cosine((iteration - self._turn) / (self._end - self._turn)) if self._turned else 1.0
 
     def done(self, iteration: int) -> float:
-        return min(1.0, iteration / ((1 + self.fall) * self._turn))
+        return iteration / self._end
+
+    @property
+    def _end(self) -> int:
+        return min(self.limit, max(self._turn + 1, round((1 + self.fall) * self._turn)))
 
 
 def withheld(count: int, share: float, rng: np.random.Generator) -> np.ndarray:

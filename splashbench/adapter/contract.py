@@ -147,7 +147,10 @@ class Fitted(ABC):
 
     @abstractmethod
     def render(self, camera: Camera, time: float) -> Render:
-        """The view of `camera` at `time` (seconds, the scene's clock), at the camera's full size."""
+        """The view of `camera` at `time` (seconds, the scene's clock), at the camera's full size.
+
+        Test views are asked for at their camera's own times: near the timesteps, at either end a little outside.
+        """
 
     @abstractmethod
     def particles(self) -> Particles | None:
