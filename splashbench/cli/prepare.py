@@ -11,14 +11,20 @@ _EPILOG = """\
 examples:
   splashbench prepare sessions/monday scenes/monday
   splashbench prepare sessions/monday scenes/monday --masks sam3_masks --interval 12.4 17.7 --replace
+  splashbench prepare sessions/monday scenes/monday --from masks --replace      the masks and the scene once more
 
 SESSION holds session.toml and the cameras' own files: per camera a clip of the ChArUco board, one of the textured
 static scene with the board lying flat on the table, and the pour with sound; and a handheld sweep of the static scene.
 SCENE appears only when every essential gate is passed; its prepare_report.html shows what was found.
+
+What a stage found is kept in SESSION/prepare. The next run does only what has changed, and goes on where one that was
+stopped had come to. Stages, in order: sync, motion, intrinsics, poses, metric, container, masks, scene.
 """
 
 # As in session.toml (splashbench.prepare.session), repeated here so that `--help` need not import it.
 _MOST_TIMESTEPS = 10_000
+# As in splashbench.prepare.stages, likewise.
+_STAGES = ("sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene")
 
 
 def register(subparsers: argparse._SubParsersAction) -> None:
@@ -48,6 +54,14 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--no-crop", action="store_true", help="keep whole frames instead of the paper's crop")
     parser.add_argument("--image-format", choices=("png", "jpg"), default="png", help="of the frames (default: png)")
+    parser.add_argument(
+        "--from",
+        dest="again_from",
+        choices=_STAGES,
+        metavar="STAGE",
+        help="do this stage and those after it again, although nothing has changed",
+    )
+    parser.add_argument("--work", type=Path, metavar="DIR", help="where results are kept (default: SESSION/prepare)")
     parser.add_argument("--replace", action="store_true", help="replace SCENE where it exists")
     add_json(parser)
     parser.set_defaults(handler=run)
@@ -76,6 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
         crop=not arguments.no_crop,
         replace=arguments.replace,
         image_format=arguments.image_format,
+        work=arguments.work,
+        again_from=arguments.again_from,
     )
     try:
         preparation = prepare(arguments.session, arguments.scene, options)
@@ -89,10 +105,15 @@ def run(arguments: argparse.Namespace) -> int:
     say(table(["gate", "value", "limit", "outcome"], rows))
     for gate in preparation.warnings:
         say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}")
-    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in preparation.stages.items())
-    say(f"wrote {arguments.scene} in {sum(preparation.stages.values()):.0f} s ({spent})")
+    done = {name: record.seconds for name, record in preparation.stages.items() if not record.reused}
+    kept = [name for name, record in preparation.stages.items() if record.reused]
+    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in done.items())
+    as_before = f"; as before: {', '.join(kept)}" if kept else ""
+    say(f"wrote {arguments.scene} in {sum(done.values()):.0f} s ({spent}{as_before})")
     if arguments.json:
-        emit({"scene": str(arguments.scene), "passed": not preparation.warnings, **preparation.as_json()})
+        stages = {name: {"seconds": round(r.seconds, 3), "reused": r.reused} for name, r in preparation.stages.items()}
+        passed = not preparation.warnings
+        emit({"scene": str(arguments.scene), "passed": passed, **preparation.as_json(), "stages": stages})
     return 0
 
 

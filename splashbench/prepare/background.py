@@ -9,8 +9,9 @@ multiples of the noise, never of a particular colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -158,3 +159,7 @@ class BackgroundMasks:
         background = Background.fit([frame for _, frame in self._read_frames(camera, quiet)])
         for index, frame in self._read_frames(camera, indices):
             yield index, segment(*background.compare(frame))
+
+    def made_from(self, camera: str, indices: Sequence[int]) -> Mapping[str, Any]:
+        """See `MaskProvider.made_from`: the frames without liquid."""
+        return {"quiet": self._quiet[camera]}

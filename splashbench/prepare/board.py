@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.arrays import Indices
 from splashbench.prepare.lens import OPENCV_PIXEL_SHIFT, Array
 
 MIN_CORNERS = 6  # a homography has eight unknowns: six corners leave enough residual to judge it
@@ -44,7 +45,7 @@ class BoardView:
     [N, 2], pixel centres at +0.5.
     """
 
-    ids: NDArray[np.int64]
+    ids: Indices
     points: Array
     pixels: Array
 

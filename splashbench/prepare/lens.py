@@ -11,9 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from splashbench.prepare.arrays import Floats
+
+Array = Floats
 OPENCV_PIXEL_SHIFT = 0.5  # our pixel coordinate minus OpenCV's, for the same point of the image
 
 

@@ -6,7 +6,8 @@ Masks are made before the crop is known, and the crop before the scene is writte
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,9 @@ from splashbench.prepare.background import BackgroundMasks
 from splashbench.prepare.crop import Box, bounding_box, crop_window
 from splashbench.prepare.masks import FolderMasks, Mask, MaskProvider, mask_health, read_raw_mask
 from splashbench.prepare.preparation import MaskRecord
-from splashbench.prepare.sampling import Sampling
 from splashbench.prepare.sync import ClockFit
 from splashbench.prepare.undistort import Undistorter
 from splashbench.prepare.video import Recording
-from splashbench.progress import track
 
 QUIET_FRAMES = 31  # before the motion, whose median is the background
 QUIET_SECONDS = 3.0  # taken from at most this long before the motion, as the light may change
@@ -53,43 +52,57 @@ def quiet_frames(recording: Recording, motion_start: float) -> list[int]:
     return before[np.linspace(0, len(before) - 1, min(len(before), QUIET_FRAMES)).astype(int)].tolist()
 
 
+@dataclass(frozen=True)
+class CameraMasks:
+    """One camera's masks, undistorted and uncropped: area in pixels of each, and the union of their boxes."""
+
+    areas: tuple[int, ...]
+    box: Box
+
+
+def make_masks(
+    folder: Path,
+    provider: MaskProvider,
+    camera: str,
+    indices: Sequence[int],
+    undistorter: Undistorter,
+    source: Recording,
+) -> CameraMasks:
+    """Fill `folder` with the undistorted masks of a camera's source frames `indices`, a PNG each.
+
+    Raises SplashbenchError where all are empty.
+    """
+    areas = []
+    union: Box | None = None
+    for t, (_, raw) in enumerate(provider.masks(camera, indices)):
+        mask = undistorter.mask(raw)
+        areas.append(int(mask.sum()))
+        box = bounding_box(mask)
+        union = box.union(union) if box else union
+        write_png(_file(folder, t), mask.astype(np.uint8) * 255)
+    if union is None:
+        raise SplashbenchError(
+            f"{source.paths[0]}: all {len(areas)} masks of camera {camera} are empty"
+            f" ({provider.name}); give masks in a folder with --masks, or set motion_interval in session.toml"
+        )
+    return CameraMasks(tuple(areas), union)
+
+
 class MaskStore:
-    """Undistorted, uncropped masks of every camera and timestep, on disk under `folder`."""
+    """The masks of all cameras as `make_masks` left them: camera -> (folder, what was found)."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.boxes: dict[str, Box] = {}  # camera -> union of its masks' boxes
+    def __init__(self, made: Mapping[str, tuple[Path, CameraMasks]]) -> None:
+        self._made = dict(made)
 
-    def fill(
-        self,
-        provider: MaskProvider,
-        sampled: Sampling,
-        undistorters: Mapping[str, Undistorter],
-        sources: Mapping[str, Recording],
-    ) -> MaskRecord:
-        """Make all masks. Raises SplashbenchError for a camera whose masks are all empty."""
-        areas: dict[str, list[int]] = {}
-        for camera, undistorter in track(undistorters.items(), f"masks ({provider.name})", total=len(undistorters)):
-            areas[camera] = []
-            union: Box | None = None
-            for t, (_, raw) in enumerate(provider.masks(camera, sampled.indices[camera].tolist())):
-                mask = undistorter.mask(raw)
-                areas[camera].append(int(mask.sum()))
-                box = bounding_box(mask)
-                union = box.union(union) if box else union
-                write_png(self._path(camera, t), mask.astype(np.uint8) * 255)
-            if union is None:
-                raise SplashbenchError(
-                    f"{sources[camera].paths[0]}: all {len(areas[camera])} masks of camera {camera} are empty"
-                    f" ({provider.name}); give masks in a folder with --masks, or set motion_interval in session.toml"
-                )
-            self.boxes[camera] = union
+    def record(self, provider: str, undistorters: Mapping[str, Undistorter]) -> MaskRecord:
+        """The masks' areas and health, for the report."""
+        areas = {camera: list(found.areas) for camera, (_, found) in self._made.items()}
         health = {camera: mask_health(areas[camera], undistorters[camera].n_pixels) for camera in areas}
-        return MaskRecord(provider.name, areas, health)
+        return MaskRecord(provider, areas, health)
 
     def read(self, camera: str, t: int) -> Mask:
         """One mask [H, W]."""
-        return np.asarray(read_gray(self._path(camera, t)) > 0)
+        return np.asarray(read_gray(_file(self._made[camera][0], t)) > 0)
 
     def windows(self, undistorters: Mapping[str, Undistorter], crop: bool) -> dict[str, Box]:
         """Camera -> the window to be written: the paper's crop, or the whole frame."""
@@ -97,11 +110,12 @@ class MaskStore:
         for camera, undistorter in undistorters.items():
             width, height = undistorter.lens.width, undistorter.lens.height
             whole = Box(0, 0, width, height)
-            windows[camera] = crop_window(self.boxes[camera], width, height) if crop else whole
+            windows[camera] = crop_window(self._made[camera][1].box, width, height) if crop else whole
         return windows
 
-    def _path(self, camera: str, t: int) -> Path:
-        return self._folder / camera / f"{t:06d}.png"
+
+def _file(folder: Path, t: int) -> Path:
+    return folder / f"{t:06d}.png"
 
 
 def container_masks(

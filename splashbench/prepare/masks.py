@@ -8,16 +8,17 @@ raw SAM3 masks in the paper are empty (Sec. S1.3), so failed masks are looked fo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray
+from splashbench.prepare.stages import facts_of
 
 # Liquid that fills more than this share of a frame is a mask of everything.
 MAX_AREA_SHARE = 0.6
@@ -35,6 +36,13 @@ class MaskProvider(Protocol):
 
     def masks(self, camera: str, indices: Sequence[int]) -> Iterator[tuple[int, Mask]]:
         """Yield (source frame index, mask [H, W] in raw geometry) in the order of `indices`, which increase."""
+        ...
+
+    def made_from(self, camera: str, indices: Sequence[int]) -> Mapping[str, Any]:
+        """What the masks of these frames depend on besides the recording: where it is the same, so are they.
+
+        Of what `stages` can store: numbers, texts, lists, files as `stages.facts_of` has them.
+        """
         ...
 
 
@@ -66,6 +74,11 @@ class FolderMasks:
                 yield index, np.zeros((height, width), bool)
                 continue
             yield index, read_raw_mask(path, width, height)
+
+    def made_from(self, camera: str, indices: Sequence[int]) -> Mapping[str, Any]:
+        """See `MaskProvider.made_from`: the files."""
+        paths = (self.folder / camera / f"{index:06d}.png" for index in indices)
+        return {"masks": facts_of(path for path in paths if path.is_file())}
 
 
 def read_raw_mask(path: Path, width: int, height: int) -> Mask:

@@ -1,18 +1,20 @@
 """Session to scene: every stage of `splashbench prepare`, in order (paper Sec. 3 and S1).
 
-Clocks from the sound, lenses from the board clips, poses from the static scene and the sweep, metres from the board,
-the motion interval and its timesteps, masks, undistortion, the crop. The scene appears only when all has succeeded.
+Clocks from the sound, the motion interval and its timesteps, lenses from the board clips, poses from the static scene
+and the sweep, metres from the board, masks, undistortion, the crop. What a stage finds is kept (`stages`), so that a
+run that was stopped goes on where it was, and only what has changed is done anew. The scene appears only when all has
+succeeded; its bytes do not depend on how often that was interrupted.
 """
 
 from __future__ import annotations
 
-import tempfile
-import time
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +22,17 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, sha256_file, write_json, write_text
 from splashbench.prepare import gates as g
-from splashbench.prepare import masking, metric, motion, rig, sampling, sync
+from splashbench.prepare import listening, masking, metric, motion, rig, sampling, sync
 from splashbench.prepare.crop import Box
+from splashbench.prepare.intrinsics import Calibration
 from splashbench.prepare.lens import Lens
+from splashbench.prepare.listening import Listening, SoundPaths
 from splashbench.prepare.masks import Mask
 from splashbench.prepare.preparation import Preparation
 from splashbench.prepare.report import html_report, outlined
 from splashbench.prepare.session import DESCRIPTION, Session
+from splashbench.prepare.stages import Stage, StageStore, facts_of, open_stages
+from splashbench.prepare.sync import ClockFit, SequenceSync
 from splashbench.prepare.undistort import Undistorter
 from splashbench.prepare.video import Recording
 from splashbench.progress import track
@@ -34,8 +40,9 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.layout import SceneMeta
 from splashbench.scene.writing import write_scene
 
-AUDIO_RATE = 48000
 THUMBNAILS = 3  # frames per camera on the report's page
+WORK_FOLDER = "prepare"  # within the session
+_UNFINISHED = "unfinished_scene.txt"
 
 ImageFormat = Literal["png", "jpg"]
 Image = NDArray[np.uint8]
@@ -45,7 +52,8 @@ Image = NDArray[np.uint8]
 class Options:
     """What a user may change. `None`: as session.toml says.
 
-    `masks`: "background", or a folder of masks; `interval`: seconds on the reference camera's clock.
+    `masks`: "background", or a folder of masks; `interval`: seconds on the reference camera's clock. `work`: where the
+    stages' results are kept, SESSION/prepare unless given; `again_from`: this stage and those after it are done anew.
     """
 
     masks: str | None = None
@@ -54,6 +62,8 @@ class Options:
     crop: bool = True
     replace: bool = False
     image_format: ImageFormat = "png"
+    work: Path | None = None
+    again_from: Stage | None = None
 
 
 def prepare(session_directory: Path, scene_directory: Path, options: Options | None = None) -> Preparation:
@@ -65,57 +75,60 @@ def prepare(session_directory: Path, scene_directory: Path, options: Options | N
     session = Session.open(session_directory)
     if options.masks not in (None, "background") and not Path(options.masks).is_dir():
         raise SplashbenchError(f"{options.masks} is not a folder of masks; give one, or --masks background")
-    with atomic_directory(
-        scene_directory, replace=options.replace, holds="train_meta.json", inputs=[session_directory]
-    ) as made:
-        with tempfile.TemporaryDirectory(prefix="splashbench-prepare-") as work:
-            preparation = _Run(session, options, Path(work)).into(made)
+    work = options.work or session.directory / WORK_FOLDER
+    with (
+        open_stages(work, options.again_from) as store,
+        _unfinished_removed(work),
+        atomic_directory(
+            scene_directory, replace=options.replace, holds="train_meta.json", inputs=[session_directory, work]
+        ) as made,
+    ):
+        (work / _UNFINISHED).write_text(str(made), encoding="utf-8")
+        preparation = _Run(session, options, store).into(made)
         write_json(made / "prepare_report.json", preparation.as_json())
         write_text(made / "prepare_report.html", html_report(preparation))
     return preparation
 
 
+@contextmanager
+def _unfinished_removed(work: Path) -> Iterator[None]:
+    """Remove the half-written scene of a run that was killed; its place is noted in `work` while one is written."""
+    note = work / _UNFINISHED
+    if note.is_file():
+        left = Path(note.read_text(encoding="utf-8"))
+        if left.name.startswith(".tmp-"):
+            shutil.rmtree(left, ignore_errors=True)
+    yield
+    note.unlink(missing_ok=True)
+
+
 @dataclass
 class _Run:
-    """One preparation: the session, a scratch folder, and the seconds every stage took."""
+    """One preparation: the session, what the user changes, and the store of results."""
 
     session: Session
     options: Options
-    work: Path
-    stages: dict[str, float] = field(default_factory=dict)
+    store: StageStore
+    thumbnails: dict[str, list[Image]] = field(default_factory=dict)
 
     def into(self, directory: Path) -> Preparation:
         """Run all stages; the scene is written into `directory`."""
         session, cameras = self.session, self.session.cameras
         recordings = rig.RigRecordings(session)
-        pour = {camera: Recording(session.paths("pour", camera)) for camera in cameras}
         # The cheap stages that most often find a fault come first.
-        with self._stage("sync"):
-            audio = {camera: pour[camera].audio(AUDIO_RATE) for camera in track(cameras, "reading sound")}
-            clocks = sync.estimate_sync(audio, AUDIO_RATE, session.reference)
-            sync.require_synced(clocks, {camera: pour[camera].paths[0] for camera in cameras})
-        with self._stage("motion"):
-            # Held-out views decide nothing about a scene, not even when it begins.
-            override = self.options.interval or session.motion_interval
-            interval = motion.find_motion(pour, clocks, session.train, override)
-            instants = sampling.sample_times(interval.interval, self.options.timesteps or session.timesteps)
-            sampled = sampling.sample_frames(instants, {name: pour[name].frame_times for name in cameras}, clocks)
-            sequence = sync.sequence_sync_rms(audio, AUDIO_RATE, clocks, interval.interval, session.reference)
-        with self._stage("intrinsics"):
-            calibrations = recordings.calibrations()
-            lenses = {camera: calibration.lens for camera, calibration in calibrations.items()}
-            recordings.check_sizes(lenses, pour)
-        with self._stage("poses"):
-            static, sweep = recordings.static_images(), recordings.sweep_images()
-            try:
-                found = rig.find_poses(static, sweep, lenses, recordings.detector, self._folder("sfm"))
-            except RuntimeError as error:  # COLMAP's, for one when its database finds the disk full
-                raise SplashbenchError(
-                    f"{session.directory}: COLMAP failed ({error}); check the space in {tempfile.gettempdir()}"
-                ) from None
-        with self._stage("metric"):
-            frame = rig.find_metres(static, sweep, lenses, found, recordings.detector)
-            placed = metric.transformed(found, frame.scene_from_sfm)
+        heard = self._listening()
+        interval = self._interval(heard.clocks)
+        sequence = self._left_over(heard.clocks, interval)
+        self._sampling(heard.clocks, interval)
+        calibrations = self._calibrations(recordings)
+        lenses = {camera: calibration.lens for camera, calibration in calibrations.items()}
+        recordings.check_sizes(lenses, self.pour)
+        posed = self._posed(recordings, lenses)
+        frame = self._metric(posed, lenses, recordings)
+        placed = metric.transformed(posed.poses, frame.scene_from_sfm)
+        paths = self._sound_paths(placed.w2c)
+        clocks = sync.shifted(heard.clocks, paths.shift_s) if paths.applied else heard.clocks
+        sampled = self._sampling(clocks, interval)
         gates = [
             *g.intrinsics_gates(calibrations),
             *g.sync_gates(clocks, sequence),
@@ -126,16 +139,12 @@ class _Run:
         g.require(gates, str(session.directory))
 
         undistorters = {camera: Undistorter(lens) for camera, lens in lenses.items()}
-        store = masking.MaskStore(self._folder("masks"))
-        with self._stage("masks"):
-            provider = masking.choose_provider(self._mask_folder(), pour, clocks, interval.start)
-            record = store.fill(provider, sampled, undistorters, pour)
+        record, store = self._masks(sampled, undistorters, clocks, interval.start)
         windows = store.windows(undistorters, self.options.crop)
-        gates += g.mask_gates(record.health, len(instants))
+        gates += g.mask_gates(record.health, len(sampled.times))
         gates.append(g.source_gate({name: undistorters[name].source_share(windows[name]) for name in cameras}))
 
-        thumbnails: dict[str, list[Image]] = {camera: [] for camera in cameras}
-        with self._stage("writing"):
+        with self.store.timed("scene"):
             write_scene(
                 directory,
                 cameras={
@@ -144,8 +153,8 @@ class _Run:
                 },
                 train=session.train,
                 test=session.test,
-                n_frames=len(instants),
-                frames=_frames(pour, sampled, undistorters, store, windows, thumbnails),
+                n_frames=len(sampled.times),
+                frames=self._frames(sampled, undistorters, store, windows),
                 meta=self._meta(sampled, windows, record.provider),
                 initial_points=metric.initial_points(placed),
                 container_masks=masking.container_masks(session.container_folder, undistorters, windows),
@@ -153,8 +162,10 @@ class _Run:
             )
         return Preparation(
             session=session,
+            heard=heard,
             calibrations=calibrations,
             clocks=clocks,
+            sound_paths=paths,
             sequence=sequence,
             poses=placed,
             metric=frame,
@@ -164,20 +175,140 @@ class _Run:
             windows=windows,
             cropped=self.options.crop,
             gates=gates,
-            stages=dict(self.stages),
-            thumbnails=thumbnails,
+            stages=dict(self.store.records),
+            thumbnails=self.thumbnails,
         )
 
-    @contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.stages[name] = round(time.perf_counter() - start, 3)
+    @cached_property
+    def pour(self) -> dict[str, Recording]:
+        """Every camera's recording of the pour."""
+        return {camera: Recording(self.session.paths("pour", camera)) for camera in self.session.cameras}
 
-    def _folder(self, name: str) -> Path:
-        path = self.work / name
-        path.mkdir()
-        return path
+    def _files(self, camera: str) -> list[tuple[str, int, int]]:
+        return facts_of(self.pour[camera].paths)
+
+    @cached_property
+    def _all_files(self) -> dict[str, Any]:
+        return {camera: self._files(camera) for camera in self.session.cameras}
+
+    def _listening(self) -> Listening:
+        inputs = {"files": self._all_files, "reference": self.session.reference}
+        return self.store.result("sync", Listening, inputs, lambda: listening.listen(self.pour, self.session.reference))
+
+    def _interval(self, clocks: Mapping[str, ClockFit]) -> motion.MotionInterval:
+        # Held-out views decide nothing about a scene, not even when it begins.
+        seen = self.session.train
+        override = self.options.interval or self.session.motion_interval
+        inputs = {"files": {camera: self._files(camera) for camera in seen}, "clocks": clocks, "given": override}
+        return self.store.result(
+            "motion", motion.MotionInterval, inputs, lambda: motion.find_motion(self.pour, clocks, seen, override)
+        )
+
+    def _left_over(self, clocks: Mapping[str, ClockFit], interval: motion.MotionInterval) -> SequenceSync:
+        inputs = {"files": self._all_files, "clocks": clocks, "interval": interval.interval}
+        reference = self.session.reference
+        return self.store.result(
+            "motion",
+            SequenceSync,
+            inputs,
+            lambda: listening.left_over(self.pour, clocks, interval.interval, reference),
+            part="left_over",
+        )
+
+    def _sampling(self, clocks: Mapping[str, ClockFit], interval: motion.MotionInterval) -> sampling.Sampling:
+        instants = sampling.sample_times(interval.interval, self.options.timesteps or self.session.timesteps)
+        inputs = {"files": self._all_files, "clocks": clocks, "instants": instants}
+        return self.store.result(
+            "motion",
+            sampling.Sampling,
+            inputs,
+            lambda: sampling.sample_frames(
+                instants, {camera: found.frame_times for camera, found in self.pour.items()}, clocks
+            ),
+            part="sampling",
+        )
+
+    def _calibrations(self, recordings: rig.RigRecordings) -> dict[str, Calibration]:
+        return {
+            camera: self.store.result(
+                "intrinsics",
+                Calibration,
+                {"files": facts_of(recordings.boards[camera].paths), "board": self.session.board},
+                partial(recordings.calibrate, camera),
+                part=camera,
+            )
+            for camera in track(self.session.cameras, "calibrating lenses")
+        }
+
+    def _posed(self, recordings: rig.RigRecordings, lenses: Mapping[str, Lens]) -> rig.PosedRig:
+        inputs = {
+            "static": {camera: facts_of(found.paths) for camera, found in recordings.static.items()},
+            "sweep": facts_of(recordings.sweep.paths) if recordings.sweep else None,
+            "lenses": lenses,
+            "board": self.session.board,
+        }
+
+        def make() -> rig.PosedRig:
+            try:
+                with self.store.scratch() as scratch:
+                    return recordings.pose(lenses, scratch)
+            except RuntimeError as error:  # COLMAP's, for one when its database finds the disk full
+                raise SplashbenchError(
+                    f"{self.session.directory}: COLMAP failed ({error}); check the space in {self.store.folder}"
+                ) from None
+
+        return self.store.result("poses", rig.PosedRig, inputs, make)
+
+    def _metric(
+        self, posed: rig.PosedRig, lenses: Mapping[str, Lens], recordings: rig.RigRecordings
+    ) -> metric.MetricFrame:
+        inputs = {"posed": posed, "board": self.session.board}
+        return self.store.result(
+            "metric", metric.MetricFrame, inputs, lambda: metric.align(posed.sightings, recordings.detector)
+        )
+
+    def _sound_paths(self, w2c: Mapping[str, NDArray[np.float64]]) -> SoundPaths:
+        """What the sound's travel does to the clocks, now that the cameras' places are known."""
+        given = self.session.sound
+        source = given.source if given else (0.0, 0.0, 0.0)
+        positions = {camera: -matrix[:3, :3].T @ matrix[:3, 3] for camera, matrix in w2c.items()}
+        distance, shift = sync.sound_paths(positions, source, self.session.reference)
+        return SoundPaths(source, given is not None, distance, shift)
+
+    def _masks(
+        self,
+        sampled: sampling.Sampling,
+        undistorters: Mapping[str, Undistorter],
+        clocks: Mapping[str, ClockFit],
+        start: float,
+    ) -> tuple[masking.MaskRecord, masking.MaskStore]:
+        provider = masking.choose_provider(self._mask_folder(), self.pour, clocks, start)
+        found = {}
+        for camera in track(self.session.cameras, f"masks ({provider.name})"):
+            indices = sampled.indices[camera].tolist()
+            inputs = {
+                "files": self._files(camera),
+                "indices": indices,
+                "lens": undistorters[camera].lens,
+                "provider": provider.name,
+                "made_from": provider.made_from(camera, indices),
+            }
+            found[camera] = self.store.files(
+                "masks",
+                masking.CameraMasks,
+                inputs,
+                partial(
+                    masking.make_masks,
+                    provider=provider,
+                    camera=camera,
+                    indices=indices,
+                    undistorter=undistorters[camera],
+                    source=self.pour[camera],
+                ),
+                part=camera,
+            )
+        store = masking.MaskStore(found)
+        return store.record(provider.name, undistorters), store
 
     def _mask_folder(self) -> Path | None:
         """The folder of masks to use; None for background subtraction."""
@@ -202,24 +333,23 @@ class _Run:
             },
         )
 
-
-def _frames(
-    pour: Mapping[str, Recording],
-    sampled: sampling.Sampling,
-    undistorters: Mapping[str, Undistorter],
-    store: masking.MaskStore,
-    windows: Mapping[str, Box],
-    thumbnails: Mapping[str, list[Image]],
-) -> Iterator[tuple[str, int, Image, Mask]]:
-    """The scene's images and masks, camera by camera; a few are kept as thumbnails in passing."""
-    shown = set(np.linspace(0, len(sampled.times) - 1, THUMBNAILS).round().astype(int).tolist())
-    for camera, recording in pour.items():
-        window = windows[camera]
-        for t, (_, raw) in enumerate(recording.frames(sampled.indices[camera].tolist())):
-            image, mask = window.cut(undistorters[camera].image(raw)), window.cut(store.read(camera, t))
-            if t in shown:
-                thumbnails[camera].append(outlined(image, mask))
-            yield camera, t, image, mask
+    def _frames(
+        self,
+        sampled: sampling.Sampling,
+        undistorters: Mapping[str, Undistorter],
+        store: masking.MaskStore,
+        windows: Mapping[str, Box],
+    ) -> Iterator[tuple[str, int, Image, Mask]]:
+        """The scene's images and masks, camera by camera; a few are kept as thumbnails in passing."""
+        shown = set(np.linspace(0, len(sampled.times) - 1, THUMBNAILS).round().astype(int).tolist())
+        for camera, recording in self.pour.items():
+            window = windows[camera]
+            kept = self.thumbnails.setdefault(camera, [])
+            for t, (_, raw) in enumerate(recording.frames(sampled.indices[camera].tolist())):
+                image, mask = window.cut(undistorters[camera].image(raw)), window.cut(store.read(camera, t))
+                if t in shown:
+                    kept.append(outlined(image, mask))
+                yield camera, t, image, mask
 
 
 def _cropped(name: str, lens: Lens, w2c: NDArray[np.float64], window: Box) -> Camera:

@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from splashbench.prepare.crop import Box
 from splashbench.prepare.gates import Gate
 from splashbench.prepare.intrinsics import Calibration
+from splashbench.prepare.listening import Listening, SoundPaths
 from splashbench.prepare.masks import MaskHealth
 from splashbench.prepare.metric import MetricFrame
 from splashbench.prepare.motion import MotionInterval
 from splashbench.prepare.poses import Poses
 from splashbench.prepare.sampling import Sampling
 from splashbench.prepare.session import Session
+from splashbench.prepare.stages import Stage, StageRecord
 from splashbench.prepare.sync import ClockFit, SequenceSync
+from splashbench.prepare.video import VideoInfo
 from splashbench.version import __version__
 
 SCHEMA_VERSION = 1
@@ -34,11 +37,16 @@ class MaskRecord:
 
 @dataclass(frozen=True)
 class Preparation:
-    """The outcome of every stage. `poses` is in the scene frame; `stages`: stage -> seconds."""
+    """The outcome of every stage. `poses` is in the scene frame; `clocks` are `heard.clocks`, corrected for the sound's
+    travel where its source is given. `stages`, how long each took, is no part of the reports: those tell of the scene
+    alone, and are the same however often a preparation was interrupted.
+    """
 
     session: Session
+    heard: Listening
     calibrations: dict[str, Calibration]
     clocks: dict[str, ClockFit]
+    sound_paths: SoundPaths
     sequence: SequenceSync
     poses: Poses
     metric: MetricFrame
@@ -48,7 +56,7 @@ class Preparation:
     windows: dict[str, Box]
     cropped: bool
     gates: list[Gate]
-    stages: dict[str, float]
+    stages: dict[Stage, StageRecord]
     thumbnails: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict, repr=False)
 
     @property
@@ -64,6 +72,13 @@ class Preparation:
             "session": self.session.name,
             "reference": self.session.reference,
             "sync": {camera: self._sync(camera) for camera in self.clocks},
+            "recordings": {camera: _recording(facts) for camera, facts in self.heard.facts.items()},
+            "sound_paths": {
+                "source": list(self.sound_paths.source),
+                "applied": self.sound_paths.applied,
+                "distance_m": self.sound_paths.distance_m,
+                "shift_s": self.sound_paths.shift_s,
+            },
             "intrinsics": {camera: _intrinsics(c) for camera, c in self.calibrations.items()},
             "poses": {camera: {"w2c": matrix.tolist()} for camera, matrix in self.poses.w2c.items()},
             "structure_from_motion": {
@@ -106,7 +121,6 @@ class Preparation:
                 "windows": {camera: [box.x0, box.y0, box.x1, box.y1] for camera, box in self.windows.items()},
             },
             "gates": [gate.as_json() for gate in self.gates],
-            "stages": self.stages,
         }
 
     def _sync(self, camera: str) -> dict[str, Any]:
@@ -119,8 +133,22 @@ class Preparation:
             "residual_rms_s": fit.residual_rms_s,
             "windows": fit.n_windows,
             "status": fit.status,
+            "seams": [{"time_s": seam.time_s, "gap_s": seam.gap_s} for seam in self.heard.seams[camera]],
             "sequence_offset_s": self.sequence.offsets_s.get(camera),
         }
+
+
+def _recording(facts: VideoInfo) -> dict[str, Any]:
+    return {
+        "width": facts.width,
+        "height": facts.height,
+        "fps": facts.fps,
+        "frames": facts.n_frames,
+        "seconds": facts.duration,
+        "codec": facts.codec,
+        "timecode": facts.timecode,
+        "audio_minus_video_s": facts.audio_minus_video_s,
+    }
 
 
 def _intrinsics(calibration: Calibration) -> dict[str, Any]:

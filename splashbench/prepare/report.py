@@ -1,7 +1,8 @@
 """prepare_report.html: what a preparation found, on one page that needs nothing else.
 
 Figures are drawn with matplotlib and embedded. What needs a person's eye comes first: the pass marks, then masks on
-the frames, then cameras, lenses and clocks.
+the frames, then cameras, lenses and clocks. The page tells of the scene alone, not of the run that made it, so that the
+same recordings always give the same bytes.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def html_report(preparation: Preparation) -> str:
         *_section("Lenses", _lenses(preparation)),
         *_section("Clocks", _clocks(preparation)),
         *_section("Motion interval", _list(preparation.motion.reasons)),
-        *_section("Time spent", _stages(preparation)),
+        *_section("Recordings", _recordings(preparation)),
     ]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -238,15 +239,87 @@ def _clocks(preparation: Preparation) -> list[str]:
     ]
     header = ["camera", "start [s]", "drift [us/s]", "confidence", "residual [us]", "windows", "left over [ms]"]
     note = (
-        "Reference time = start + (1 + drift) x local time, by arrival of the sound (2.9 ms per metre of path). Left"
-        " over: offset found anew within the sequence, centred."
+        "Reference time = start + (1 + drift) x local time. Left over: offset found anew within the sequence, centred."
+        " Below: every window of sound by which a clock was found, and its delay beyond the clock's line. The scatter"
+        " is how well single windows agree; a bend would be a clock whose rate changed."
     )
-    return [_table(header, rows), f'<p class="note">{note}</p>']
+    return [
+        _table(header, rows),
+        f'<p class="note">{note}</p>',
+        *_windows(preparation),
+        *_sound_paths(preparation),
+    ]
 
 
-def _stages(preparation: Preparation) -> list[str]:
-    rows = [[name, f"{seconds:.1f}"] for name, seconds in preparation.stages.items()]
-    return [_table(["stage", "seconds"], [*rows, ["all", f"{sum(preparation.stages.values()):.1f}"]])]
+def _windows(preparation: Preparation) -> list[str]:
+    """Where the windows' delays lie about every camera's clock."""
+    from matplotlib.figure import Figure
+
+    fitted = {camera: fit for camera, fit in preparation.clocks.items() if fit.windows}
+    if not fitted:
+        return []
+    columns = min(3, len(fitted))
+    rows = -(-len(fitted) // columns)
+    figure = Figure(figsize=(9, 1.9 * rows), layout="constrained")
+    for index, (camera, fit) in enumerate(fitted.items()):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        times, residuals = np.array(fit.windows).T
+        axes.axhline(0, color=SWEEP_COLOUR, linewidth=0.8)
+        axes.plot(times, residuals * 1e6, ".", color=TRAIN_COLOUR, markersize=3)
+        axes.set_title(f"camera {camera}", fontsize=9)
+        axes.set(xlabel="local time [s]", ylabel="delay [us]")
+        axes.tick_params(labelsize=8)
+    return [_figure(figure)]
+
+
+def _sound_paths(preparation: Preparation) -> list[str]:
+    paths = preparation.sound_paths
+    rows = [
+        [camera, f"{paths.distance_m[camera]:.2f}", f"{paths.shift_s[camera] * 1e3:+.2f}"]
+        for camera in paths.distance_m
+    ]
+    place = "({:.2f}, {:.2f}, {:.2f}) m".format(*paths.source)
+    if paths.applied:
+        note = f"The sound came from {place}, and its travel is taken out of the clocks above."
+    else:
+        note = (
+            "The clocks above go by the sound's arrival. Had it come from the scene's origin, its travel would shift"
+            " them as below; give [sound] source in session.toml to have it taken out."
+        )
+    header = ["camera", "way of the sound [m]", "shift of the clock [ms]"]
+    return [f'<p class="note">{note}</p>', _table(header, rows)]
+
+
+def _recordings(preparation: Preparation) -> list[str]:
+    rows = []
+    for camera, facts in preparation.heard.facts.items():
+        longer = facts.audio_minus_video_s
+        seams = preparation.heard.seams[camera]
+        rows.append(
+            [
+                camera,
+                f"{facts.width}x{facts.height}",
+                f"{facts.fps:.3f}",
+                str(facts.n_frames),
+                f"{facts.duration:.2f}",
+                facts.codec,
+                facts.timecode or "none",
+                "unknown" if longer is None else f"{longer * 1e3:+.2f}",
+                ", ".join(f"{seam.gap_s * 1e3:+.1f} ms at {seam.time_s:.1f} s" for seam in seams) or "none",
+            ]
+        )
+    header = [
+        "camera",
+        "size",
+        "fps",
+        "frames",
+        "seconds",
+        "codec",
+        "timecode",
+        "sound - video [ms]",
+        "gaps in the sound",
+    ]
+    return [_table(header, rows)]
 
 
 def _centre(w2c: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,14 @@ Image = NDArray[np.uint8]
 
 STATIC_FRAMES = 15  # of a static clip, whose median is the picture
 SHARPNESS_WIDTH = 480
+
+
+@dataclass(frozen=True)
+class PosedRig:
+    """Poses in structure from motion's own units, and the board as the posed images show it."""
+
+    poses: poses.Poses
+    sightings: tuple[metric.Sighting, ...]
 
 
 class RigRecordings:
@@ -42,12 +51,11 @@ class RigRecordings:
 
     def calibrations(self) -> dict[str, Calibration]:
         """Every camera's lens from its board clip."""
-        return {
-            camera: self._calibrate(recording)
-            for camera, recording in track(self.boards.items(), "calibrating lenses", total=len(self.boards))
-        }
+        return {camera: self.calibrate(camera) for camera in track(self.session.cameras, "calibrating lenses")}
 
-    def _calibrate(self, recording: Recording) -> Calibration:
+    def calibrate(self, camera: str) -> Calibration:
+        """One camera's lens from its board clip."""
+        recording = self.boards[camera]
         indices = frames_to_search(len(recording.frame_times))
         images = (image for _, image in recording.frames(indices))
         return calibrate(images, self.detector, str(recording.paths[0]))
@@ -68,6 +76,12 @@ class RigRecordings:
         sharpness = [poses.sharpness_of(luma) for _, luma in self.sweep.luma(SHARPNESS_WIDTH)]
         chosen = poses.sharpest_per_bin(sharpness, poses.SWEEP_FRAMES)
         return [frame for _, frame in self.sweep.frames(chosen)]
+
+    def pose(self, lenses: Mapping[str, Lens], work: Path) -> PosedRig:
+        """Structure from motion of the static scene, and where it shows the board; `work` is an empty folder."""
+        static, sweep = self.static_images(), self.sweep_images()
+        found = find_poses(static, sweep, lenses, self.detector, work)
+        return PosedRig(found, find_sightings(static, sweep, lenses, found, self.detector))
 
     def check_sizes(self, lenses: Mapping[str, Lens], others: Mapping[str, Recording]) -> None:
         """Raise SplashbenchError where a camera recorded at another size than its lens was calibrated at."""
@@ -92,6 +106,20 @@ def find_poses(
     return poses.estimate_poses(static, lenses, sweep, work, focal_guess(sweep, detector))
 
 
+def find_sightings(
+    static: Mapping[str, Image],
+    sweep: Sequence[Image],
+    lenses: Mapping[str, Lens],
+    found: poses.Poses,
+    detector: BoardDetector,
+) -> tuple[metric.Sighting, ...]:
+    """The board in the static pictures and in the sweep's posed frames."""
+    candidates = [(image, lenses[camera], found.w2c[camera]) for camera, image in static.items()]
+    candidates += [(sweep[index], found.sweep_lens, w2c) for index, w2c in zip(found.sweep_indices, found.sweep_w2c)]
+    views = [(detector.detect_true(image), lens, w2c) for image, lens, w2c in candidates]
+    return tuple(metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None)
+
+
 def find_metres(
     static: Mapping[str, Image],
     sweep: Sequence[Image],
@@ -100,8 +128,4 @@ def find_metres(
     detector: BoardDetector,
 ) -> metric.MetricFrame:
     """The scene frame from the board in the static pictures and in the sweep."""
-    candidates = [(image, lenses[camera], found.w2c[camera]) for camera, image in static.items()]
-    candidates += [(sweep[index], found.sweep_lens, w2c) for index, w2c in zip(found.sweep_indices, found.sweep_w2c)]
-    views = [(detector.detect_true(image), lens, w2c) for image, lens, w2c in candidates]
-    sightings = [metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None]
-    return metric.align(sightings, detector)
+    return metric.align(find_sightings(static, sweep, lenses, found, detector), detector)

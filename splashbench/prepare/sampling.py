@@ -12,12 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.arrays import Flags, Floats, Indices
 from splashbench.prepare.sync import ClockFit
-
-Floats = NDArray[np.float64]
 
 _ROUNDING_S = 1e-6  # timestamps are whole ticks of the file's time base
 
@@ -34,9 +32,9 @@ class Sampling:
 
     nominal: Floats
     times: Floats
-    indices: dict[str, NDArray[np.int64]]
+    indices: dict[str, Indices]
     camera_times: dict[str, Floats]
-    flagged: dict[str, NDArray[np.bool_]]
+    flagged: dict[str, Flags]
 
     @property
     def spread_s(self) -> Floats:
@@ -60,9 +58,9 @@ def sample_frames(times: Floats, frame_times: Mapping[str, Floats], clocks: Mapp
     (`Recording.frame_times`); `clocks`: from `sync.estimate_sync`. Raises SplashbenchError when a camera did
     not record the interval, or when a frame would have to stand for two timesteps.
     """
-    indices: dict[str, NDArray[np.int64]] = {}
+    indices: dict[str, Indices] = {}
     camera_times: dict[str, Floats] = {}
-    flagged: dict[str, NDArray[np.bool_]] = {}
+    flagged: dict[str, Flags] = {}
     for camera, local in frame_times.items():
         common = clocks[camera].to_reference(local)
         if len(common) < 2:
@@ -87,7 +85,7 @@ def sample_frames(times: Floats, frame_times: Mapping[str, Floats], clocks: Mapp
     return Sampling(np.asarray(times, np.float64), mean, indices, camera_times, flagged)
 
 
-def _nearest(increasing: Floats, times: Floats) -> NDArray[np.int64]:
+def _nearest(increasing: Floats, times: Floats) -> Indices:
     """Index of the entry nearest to each time; the earlier one of two equally near."""
     after = np.clip(np.searchsorted(increasing, times), 1, len(increasing) - 1)
     before = after - 1

@@ -60,6 +60,21 @@ class Sweep(_Strict):
     files: Chapters
 
 
+class Sound(_Strict):
+    """Where the sound came from by which clocks are found: `source` [3], metres in the scene's frame (its origin is the
+    board's centre, +y up, +x along the print). Given, the sound's travel (2.9 ms per metre) is taken out of the clocks.
+    """
+
+    source: tuple[float, float, float]
+
+    @field_validator("source")
+    @classmethod
+    def _is_within_earshot(cls, source: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(abs(value) < 100 for value in source):
+            raise ValueError("source must be [x, y, z] in metres, below 100 m each")
+        return source
+
+
 class Masks(_Strict):
     """Where liquid masks come from: `background` subtraction, or a `folder` of <camera>/<source frame:06d>.png.
 
@@ -90,6 +105,7 @@ class Session(_Strict):
     board: Board | None = None
     recordings: Recordings
     sweep: Sweep | None = None
+    sound: Sound | None = None
     masks: Masks = Field(default_factory=Masks)
 
     _directory: Path = PrivateAttr(default=Path())

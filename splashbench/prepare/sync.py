@@ -49,8 +49,8 @@ class ClockFit:
     """A camera's clock against the reference's: t_reference = start_s + clock_rate * t_local (seconds).
 
     `confidence`: correlation peak over the highest other peak. `residual_rms_s`: scatter of the `n_windows`
-    windows about the line. Where `status` is not "ok", start_s and clock_rate are NaN: a doubtful track is
-    never given an offset.
+    windows about the line; `windows`: (local time, delay beyond the line) of each, in seconds. Where `status` is not
+    "ok", start_s and clock_rate are NaN: a doubtful track is never given an offset.
     """
 
     start_s: float
@@ -59,6 +59,7 @@ class ClockFit:
     residual_rms_s: float
     n_windows: int
     status: Status
+    windows: tuple[tuple[float, float], ...] = ()
 
     def to_reference(self, local_s: ArrayLike) -> Floats:
         """Local seconds to seconds on the reference camera's clock."""
@@ -173,7 +174,8 @@ def _fit_pair(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> ClockF
     if confidence < MIN_CONFIDENCE or len(kept) < 2:
         return _flagged("unrelated", confidence, len(kept))
     rms = float(np.sqrt(np.mean(residuals**2)))
-    return ClockFit(line[0], line[1], confidence, rms, len(kept), "ok")
+    scatter = tuple((window.time_s, float(residual)) for window, residual in zip(kept, residuals))
+    return ClockFit(line[0], line[1], confidence, rms, len(kept), "ok", scatter)
 
 
 def _window_seconds(overlap: float) -> float:
@@ -279,17 +281,28 @@ def sequence_sync_rms(
     return SequenceSync(rms, centred, tuple(unmeasured))
 
 
-def correct_for_sound_paths(
-    fits: Mapping[str, ClockFit], positions: Mapping[str, ArrayLike], source: ArrayLike, reference: str
-) -> dict[str, ClockFit]:
-    """Take the sound's travel out of the fits, once camera positions [3] and the source's [3] are known, all in metres.
+def sound_paths(
+    positions: Mapping[str, ArrayLike], source: ArrayLike, reference: str
+) -> tuple[dict[str, float], dict[str, float]]:
+    """The way of the sound to every camera, in metres, and what it adds to the start of the camera's clock, seconds.
 
-    Sound reached camera and reference at different times, which the fit took for the same: a camera farther
-    away than the reference heard it later, so its clock shows a later time than was believed.
+    `positions`: camera -> [3]; `source`: [3], both in metres in the same frame. Sound reached camera and reference at
+    different times, which the fit took for the same: a camera farther away than the reference heard it later, so its
+    clock shows a later time than was believed.
     """
     where = np.asarray(source, np.float64)
     distance = {camera: float(np.linalg.norm(np.asarray(at, np.float64) - where)) for camera, at in positions.items()}
-    return {
-        camera: replace(fit, start_s=fit.start_s + (distance[camera] - distance[reference]) / SPEED_OF_SOUND)
-        for camera, fit in fits.items()
-    }
+    return distance, {camera: (way - distance[reference]) / SPEED_OF_SOUND for camera, way in distance.items()}
+
+
+def shifted(fits: Mapping[str, ClockFit], shift_s: Mapping[str, float]) -> dict[str, ClockFit]:
+    """The clocks with `shift_s` added to their starts."""
+    return {camera: replace(fit, start_s=fit.start_s + shift_s[camera]) for camera, fit in fits.items()}
+
+
+def correct_for_sound_paths(
+    fits: Mapping[str, ClockFit], positions: Mapping[str, ArrayLike], source: ArrayLike, reference: str
+) -> dict[str, ClockFit]:
+    """Take the sound's travel out of the fits, once the cameras' positions and the source's are known; see
+    `sound_paths`."""
+    return shifted(fits, sound_paths(positions, source, reference)[1])

@@ -1,0 +1,211 @@
+"""What the stages of a preparation found, kept on disk so that no work is done twice.
+
+A result is stored with a key: the SHA-256 of everything that it was made from, files by their name, size and time of
+modification. The next run takes a result whose key is still the same, and makes the others anew; so does a run after
+one that was killed, since a result appears whole (written beside its place, then renamed) or not at all. A stage that
+leaves files fills a folder whose result is written last: without it the folder is rubbish, and is made anew.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.metadata
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import numpy as np
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import atomic_path
+from splashbench.prepare.arrays import plain
+from splashbench.version import __version__
+
+Stage = Literal["sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene"]
+STAGES: tuple[Stage, ...] = get_args(Stage)
+
+# Results depend on these as much as on the recordings.
+_LIBRARIES = ("av", "numpy", "opencv-contrib-python-headless", "pycolmap", "scipy")
+_MARK = "This folder holds what `splashbench prepare` found out about the session beside it. It may be deleted.\n"
+_MARK_NAME, _LOCK_NAME, _SCRATCH_NAME = "README.txt", ".lock", "scratch"
+
+T = TypeVar("T")
+
+
+@dataclass
+class StageRecord:
+    """How long a stage took when it was made, in seconds, and whether this run took it as it was."""
+
+    seconds: float = 0.0
+    reused: bool = True
+
+
+class StageStore:
+    """The results of a session's stages below one folder. Make it with `open_stages`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.records: dict[Stage, StageRecord] = {}
+        self._versions = {name: importlib.metadata.version(name) for name in _LIBRARIES}
+
+    def result(self, stage: Stage, kind: Any, inputs: Mapping[str, Any], make: Callable[[], T], part: str = "") -> T:
+        """The stored result of `stage` where it was made from the same `inputs`, else what `make` returns, stored.
+
+        kind: the result's type. part: what of the stage, such as a camera, where it has several parts.
+        """
+        return self._obtain(stage, kind, inputs, part, make, lambda: None)
+
+    def files(
+        self, stage: Stage, kind: Any, inputs: Mapping[str, Any], make: Callable[[Path], T], part: str = ""
+    ) -> tuple[Path, T]:
+        """As `result`, for a stage that leaves files as well: `make` fills the empty folder that it is given."""
+        folder = self._path(stage, part).with_suffix("")
+
+        def clear() -> None:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+
+        return folder, self._obtain(stage, kind, inputs, part, lambda: make(folder), clear)
+
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """An empty folder for files that nobody needs afterwards."""
+        folder = self.folder / _SCRATCH_NAME
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @contextmanager
+    def timed(self, stage: Stage) -> Iterator[None]:
+        """Count what happens within towards the stage's time, as work that is never stored."""
+        start = time.perf_counter()
+        yield
+        record = self.records.setdefault(stage, StageRecord())
+        record.seconds += time.perf_counter() - start
+        record.reused = False
+
+    def forget(self, first: Stage) -> None:
+        """Delete the results of `first` and of all stages after it."""
+        for stage in STAGES[STAGES.index(first) :]:
+            self._path(stage, "").unlink(missing_ok=True)
+            shutil.rmtree(self.folder / stage, ignore_errors=True)
+
+    def _obtain(
+        self,
+        stage: Stage,
+        kind: Any,
+        inputs: Mapping[str, Any],
+        part: str,
+        make: Callable[[], T],
+        before: Callable[[], None],
+    ) -> T:
+        path = self._path(stage, part)
+        key = self._key(stage, part, inputs)
+        record = self.records.setdefault(stage, StageRecord())
+        stored = _read(path, key, TypeAdapter(kind))
+        if stored is not None:
+            record.seconds += stored[0]
+            value: T = stored[1]
+            return value
+        path.unlink(missing_ok=True)  # before its files go: a result without its files must not be found
+        before()
+        start = time.perf_counter()
+        made = make()
+        seconds = time.perf_counter() - start
+        record.seconds += seconds
+        record.reused = False
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps({"key": key, "seconds": round(seconds, 3), "result": _plain(made)}))
+        return made
+
+    def _path(self, stage: Stage, part: str) -> Path:
+        return self.folder / stage / f"{part}.json" if part else self.folder / f"{stage}.json"
+
+    def _key(self, stage: Stage, part: str, inputs: Mapping[str, Any]) -> str:
+        made_from = {"stage": stage, "part": part, "splashbench": __version__, **self._versions, "inputs": inputs}
+        return hashlib.sha256(json.dumps(_plain(made_from), sort_keys=True).encode()).hexdigest()
+
+
+@contextmanager
+def open_stages(folder: Path, again_from: Stage | None = None) -> Iterator[StageStore]:
+    """The store in `folder`, held for this process alone; `again_from` and what follows it are made anew.
+
+    Raises SplashbenchError where the folder cannot be written, holds something else, or is held by another process.
+    """
+    folder = Path(folder)
+    try:
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / _MARK_NAME).is_file():
+            raise SplashbenchError(f"{folder} holds something else; name another folder with --work")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _MARK_NAME).write_text(_MARK, encoding="utf-8")
+        lock = (folder / _LOCK_NAME).open("w")
+    except OSError as error:
+        raise SplashbenchError(
+            f"{folder} cannot be written ({error.strerror}); name another folder with --work"
+        ) from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise SplashbenchError(
+                f"{folder} is in use by another `splashbench prepare`; wait for it, or name another folder with --work"
+            ) from None
+        store = StageStore(folder)
+        if again_from is not None:
+            store.forget(again_from)
+        yield store
+
+
+def facts_of(paths: Iterable[Path]) -> list[tuple[str, int, int]]:
+    """What tells files from their earlier selves: (name, bytes, nanoseconds of modification) of each.
+
+    A folder stands for the files directly in it.
+    """
+    facts = []
+    for path in paths:
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            status = file.stat()
+            facts.append((f"{path.name}/{file.name}", status.st_size, status.st_mtime_ns))
+    return facts
+
+
+def _plain(value: Any) -> Any:
+    """`value` of dataclasses, models, containers and arrays as JSON has it."""
+    if isinstance(value, np.ndarray):
+        return plain(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if is_dataclass(value) and not isinstance(value, type):
+        return {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{type(value).__name__} cannot be stored")
+
+
+def _read(path: Path, key: str, adapter: TypeAdapter[Any]) -> tuple[float, Any] | None:
+    """(seconds, result) from a stored result with this key; None where there is none that can be read."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if stored["key"] != key:
+            return None
+        return float(stored["seconds"]), adapter.validate_python(stored["result"])
+    except (OSError, ValueError, KeyError, TypeError, ValidationError):
+        return None
