@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from splashbench.cli.output import add_json, emit, say, table
 
 _EPILOG = """\
 examples:
+  splashbench prepare sessions/monday --init --square-metres 0.03               write session.toml by looking
   splashbench prepare sessions/monday scenes/monday
   splashbench prepare sessions/monday scenes/monday --masks sam3_masks --interval 12.4 17.7 --replace
   splashbench prepare sessions/monday scenes/monday --from masks --replace      the masks and the scene once more
@@ -27,6 +29,18 @@ _MOST_TIMESTEPS = 10_000
 _STAGES = ("sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene")
 
 
+class _WithoutScene(argparse.Action):
+    """A flag that makes SCENE needless. (With nargs="?" instead, no option could stand between SESSION and SCENE.)"""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, scene: argparse.Action, help: str) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=False, help=help)
+        self._scene = scene
+
+    def __call__(self, parser: object, namespace: argparse.Namespace, *_: object) -> None:
+        setattr(namespace, self.dest, True)
+        self._scene.required = False
+
+
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
     parser = subparsers.add_parser(
@@ -37,7 +51,16 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("session", type=Path, metavar="SESSION", help="folder with session.toml")
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder to be made")
+    scene = parser.add_argument("scene", type=Path, metavar="SCENE", help="folder to be made")
+    parser.add_argument(
+        "--init",
+        action=_WithoutScene,
+        scene=scene,
+        help="write SESSION/session.toml by looking at the recordings, and no scene",
+    )
+    parser.add_argument(
+        "--square-metres", type=_metres, metavar="M", help="with --init: side of one square of the printed board"
+    )
     parser.add_argument(
         "--masks",
         metavar="background|FOLDER",
@@ -64,7 +87,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--work", type=Path, metavar="DIR", help="where results are kept (default: SESSION/prepare)")
     parser.add_argument("--replace", action="store_true", help="replace SCENE where it exists")
     add_json(parser)
-    parser.set_defaults(handler=run)
+    parser.set_defaults(handler=run, parser=parser)
 
 
 def _at_least_two(text: str) -> int:
@@ -73,8 +96,52 @@ def _at_least_two(text: str) -> int:
     return int(text)
 
 
+def _metres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 10:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length in metres between 0 and 10")
+    return value
+
+
+def _describe(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench prepare SESSION --init`."""
+    from splashbench.prepare.description import describe
+
+    found = describe(arguments.session, arguments.square_metres, arguments.replace)
+    rows = [
+        [film.camera or "-", film.filmed or "not used", str(len(film.files)), film.files[0]] for film in found.films
+    ]
+    say(table(["camera", "shows", "files", "first file"], rows))
+    if found.board is not None:
+        board = found.board
+        say(f"board: {board.squares_x}x{board.squares_y} squares, {board.dictionary}")
+    for line in found.to_do:
+        say(f"to do: {line}")
+    say(f"wrote {found.path}; check it, then run: splashbench prepare {arguments.session} SCENE")
+    if arguments.json:
+        emit(
+            {
+                "session": str(found.path),
+                "cameras": list(found.cameras),
+                "films": [{"camera": f.camera, "shows": f.filmed, "files": list(f.files)} for f in found.films],
+                "board": vars(found.board) if found.board else None,
+                "to_do": list(found.to_do),
+            }
+        )
+    return 0
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench prepare`."""
+    if arguments.init:
+        if arguments.scene is not None:
+            arguments.parser.error("--init writes session.toml and makes no scene; leave SCENE out")
+        return _describe(arguments)
+    if arguments.square_metres is not None:
+        arguments.parser.error("--square-metres goes with --init")
     from splashbench.errors import SplashbenchError
     from splashbench.prepare.pipeline import Options, prepare
 

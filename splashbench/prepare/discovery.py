@@ -1,0 +1,123 @@
+"""Which files of a folder are whose recording of what, told from their names.
+
+Cameras write GX010003.MP4, GX020003.MP4, ...: chapters 1, 2, ... of recording 3 (GH, GL, GP and GOPR likewise, GoPro's
+"Camera File Chaptering Information"). A camera is told from the folder its files lie in or from what stands before the
+camera's own name (cam1_GX010003.MP4); what was filmed, from words such as "pour" or "static" in either. What the names
+leave open is left open here: `looking` looks into the films.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from splashbench.errors import SplashbenchError
+
+Filmed = Literal["intrinsics", "static", "pour", "sweep"]
+
+_FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".360")
+_LEFT_OUT = ("truth", "prepare", "masks")  # folders that hold no recordings of the session
+_MOST_FILES = 10_000
+_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*(?:G[HXLS](?P<chapter>\d{2})(?P<number>\d{4}))$", re.IGNORECASE)
+_FIRST_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*GOPR(?P<number>\d{4})$", re.IGNORECASE)
+_LATER_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*GP(?P<chapter>\d{2})(?P<number>\d{4})$", re.IGNORECASE)
+_WORDS: dict[Filmed, tuple[str, ...]] = {
+    "intrinsics": ("intrinsics", "intrinsic", "calibration", "calib", "board", "charuco", "checkerboard", "lens"),
+    "static": ("static", "background", "empty", "extrinsics", "extrinsic", "poses"),
+    "pour": ("pour", "pouring", "liquid", "splash", "fluid", "recording", "take"),
+    "sweep": ("sweep", "handheld", "scan", "walk"),
+}
+# Folders that a camera's card or a tidy person makes, which name no camera.
+_PLAIN = re.compile(r"^(cameras?|videos?|raw|dcim|\d{3}gopro|films?|footage)$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Film:
+    """One recording: its chapters in order, relative to the folder; its camera, "" where the name tells none; and what
+    was filmed, None where the name does not say."""
+
+    files: tuple[str, ...]
+    camera: str
+    filmed: Filmed | None
+
+
+def find_films(folder: Path) -> list[Film]:
+    """All recordings below `folder`, sorted by camera and name. Raises SplashbenchError where there is none."""
+    chapters: dict[tuple[str, str, str], list[tuple[int, str]]] = {}
+    for path in _film_files(folder):
+        relative = path.relative_to(folder)
+        before, number, chapter = _split(path.stem)
+        chapters.setdefault((relative.parent.as_posix(), before, number), []).append((chapter, relative.as_posix()))
+    if not chapters:
+        raise SplashbenchError(
+            f"{folder}: no film in it or below it; copy the cameras' files there ({', '.join(_FILMS)})"
+        )
+    films = []
+    for (parent, before, number), found in chapters.items():
+        # A name that is not a camera's own may itself say what was filmed.
+        words = [*([] if parent == "." else parent.split("/")), before if number else found[0][1].split("/")[-1][:-4]]
+        camera, filmed = _camera_and_subject(words)
+        films.append(Film(tuple(name for _, name in sorted(found)), camera, filmed))
+    return sorted(films, key=lambda film: (natural(film.camera), film.files))
+
+
+def _film_files(folder: Path) -> list[Path]:
+    found: list[Path] = []
+    for root, folders, names in os.walk(folder):
+        folders[:] = sorted(
+            name
+            for name in folders
+            if not name.startswith(".") and not (Path(root) == Path(folder) and name.lower() in _LEFT_OUT)
+        )
+        found += [Path(root, name) for name in sorted(names) if name.lower().endswith(_FILMS) and name[0] != "."]
+        if len(found) > _MOST_FILES:
+            raise SplashbenchError(f"{folder} holds over {_MOST_FILES} films; give one session's folder")
+    return found
+
+
+def _split(stem: str) -> tuple[str, str, int]:
+    """What stands before a camera's own name, the recording's number in it ("" without one) and the chapter."""
+    for pattern in (_CHAPTER, _FIRST_CHAPTER, _LATER_CHAPTER):
+        match = pattern.match(stem)
+        if match:
+            groups = match.groupdict()
+            return groups["before"], groups["number"], int(groups.get("chapter") or 0)
+    return stem, "", 0
+
+
+def _camera_and_subject(words: Sequence[str]) -> tuple[str, Filmed | None]:
+    """What the parts of a path say: the camera's name made of those that name no subject, and the subject."""
+    filmed: Filmed | None = None
+    kept = []
+    for word in words:
+        parts = [part for part in re.split(r"[ _.-]+", word) if part]
+        rest = []
+        for part in parts:
+            subject = next((name for name, known in _WORDS.items() if part.lower() in known), None)
+            if subject is None:
+                rest.append(part)
+            else:
+                filmed = subject
+        if rest and not _PLAIN.match("_".join(rest)):
+            kept.append("_".join(rest))
+    camera = re.sub(r"[^A-Za-z0-9_-]", "", "-".join(kept)).strip("_-")[:64]
+    return ("" if filmed == "sweep" else camera), filmed
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorts cam2 before cam10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
+
+
+def with_subject(film: Film, filmed: Filmed) -> Film:
+    """The film, known to show `filmed`."""
+    return replace(film, filmed=filmed)
+
+
+def cameras_of(films: Iterable[Film]) -> list[str]:
+    """The names of the cameras, in natural order."""
+    return sorted({film.camera for film in films if film.filmed != "sweep"}, key=natural)
