@@ -89,6 +89,7 @@ def calibrate_views(
     true_views = reject_false(detections, size)
     _require(len(true_views), detector, source, n_searched)
     chosen = spread_out(true_views, detector, size, MAX_VIEWS)
+    _require(len(chosen), detector, source, n_searched)
     trimmed = _without_outlier_corners(chosen, size)
     errors = _fit(trimmed, size).view_errors
     good = [index for index, error in enumerate(errors) if error <= OUTLIER_FACTOR * np.median(errors)]
@@ -229,14 +230,14 @@ def _deviations(per_view: list[tuple[Array, Array]], free: list[int]) -> Array:
     result = np.zeros(9)
     count, whole = len(per_view), np.sum(normal, axis=0)
     try:
-        independent = np.diag(np.linalg.inv(whole)) * squares / max(freedom, 1)
+        inverse = np.diag(np.linalg.inv(whole))
         without = np.array([np.linalg.solve(whole - part, -gradient) for part, gradient in zip(normal, gradients)])
     except np.linalg.LinAlgError:
         result[free] = np.inf
         return result
+    independent = np.where(inverse > 0, inverse, np.inf) * (squares / max(freedom, 1))
     jackknife = (count - 1) / count * ((without - without.mean(0)) ** 2).sum(0)
-    variance = np.maximum(independent, jackknife)
-    result[free] = np.sqrt(np.where(variance >= 0, variance, np.inf))
+    result[free] = np.sqrt(np.maximum(independent, jackknife))
     return result
 
 

@@ -197,6 +197,12 @@ def test_too_few_boards_is_one_line_naming_the_clip(detector: BoardDetector) -> 
         calibrate(blank, detector, "GX01.MP4")
 
 
+def test_copies_of_one_view_count_once(detector: BoardDetector) -> None:
+    view = ideal_view(detector, LENS, np.random.default_rng(13))
+    with pytest.raises(SplashbenchError, match="usable in 1 of 20 frames"):
+        calibrate_views([view] * 20, detector, (WIDTH, HEIGHT), "clip.mp4", 20)
+
+
 def test_unknown_dictionary_is_refused() -> None:
     layout = BOARD.model_copy(update={"dictionary": "DICT_NONSENSE"})
     with pytest.raises(SplashbenchError, match="DICT_NONSENSE"):

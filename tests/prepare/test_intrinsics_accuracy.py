@@ -129,7 +129,6 @@ def test_the_focal_deviation_is_what_repetitions_show(detector: BoardDetector, b
         sigmas = cv2.calibrateCameraExtended(objects, pixels, (3840, 2160), None, None, flags=cv2.CALIB_FIX_K3)[5]
         naive.append(float(np.sqrt(np.mean(np.ravel(sigmas)[:2] ** 2))))
     scatter = float(np.sqrt(np.mean(np.square(errors))))
-    print(f"scatter {scatter:.2f} given {np.mean(given):.2f} independent corners {np.mean(naive):.2f} px")
     assert 0.7 * scatter < np.mean(given) < 2.2 * scatter
     if bend:
         assert np.mean(naive) < 0.5 * scatter
