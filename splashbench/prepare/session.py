@@ -1,8 +1,9 @@
 """The raw session on disk: which camera recorded what, as its owner wrote it down in session.toml.
 
 A session is one sitting with fixed cameras (paper Sec. 3, "Capture and calibration"): per camera a clip of
-the ChArUco board, a recording of the textured static scene and one of the pour, and optionally a handheld
-sweep. Long recordings are split by the camera into chapters, which are listed in order.
+the calibration board, a recording of the textured static scene and one of the pour, and optionally a handheld
+sweep. Long recordings are split by the camera into chapters, which are listed in order. All but the pour may be
+photographs instead of video: a folder of them stands for a chapter.
 """
 
 from __future__ import annotations
@@ -29,25 +30,42 @@ class _Strict(BaseModel):
 
 
 class Board(_Strict):
-    """The ChArUco board: squares along x and y, side lengths in metres, and how its pattern is laid out."""
+    """The calibration board: squares along x and y, side lengths in metres, and how its pattern is laid out.
 
+    A checkerboard has no markers, and needs four squares each way: its pattern is recognised by its inner corners.
+    """
+
+    kind: Literal["charuco", "checkerboard"] = "charuco"
     squares_x: int = Field(ge=2, le=100)
     squares_y: int = Field(ge=2, le=100)
     square_metres: float = Field(gt=0, lt=10)
-    marker_metres: float = Field(gt=0, lt=10)
-    dictionary: str = Field(pattern=r"^DICT_[A-Z0-9_]+$")
+    marker_metres: float | None = Field(default=None, gt=0, lt=10)
+    dictionary: str | None = Field(default=None, pattern=r"^DICT_[A-Z0-9_]+$")
     legacy: bool = False
     inverted: bool = False
 
     @model_validator(mode="after")
-    def _marker_fits(self) -> Board:
-        if self.marker_metres >= self.square_metres:
+    def _fits_its_kind(self) -> Board:
+        if self.kind == "checkerboard":
+            if self.marker_metres is not None or self.dictionary is not None or self.legacy:
+                raise ValueError("a checkerboard has no marker_metres, dictionary or legacy; leave them out")
+            if min(self.squares_x, self.squares_y) < 4:
+                raise ValueError("a checkerboard needs at least 4 squares each way; count squares, not inner corners")
+        elif self.marker_metres is None or self.dictionary is None:
+            raise ValueError(
+                'a ChArUco board needs marker_metres and dictionary; give both, or kind = "checkerboard" for a board'
+                " without markers"
+            )
+        elif self.marker_metres >= self.square_metres:
             raise ValueError("marker_metres must be smaller than square_metres: a marker lies inside its square")
         return self
 
 
 class Recordings(_Strict):
-    """Per kind of recording: camera name -> its chapters in order, relative to the session's folder."""
+    """Per kind of recording: camera name -> its chapters in order, relative to the session's folder.
+
+    A chapter of `static` or `intrinsics` may be a folder of photographs.
+    """
 
     pour: dict[str, Chapters]
     static: dict[str, Chapters] = Field(default_factory=dict)
@@ -55,7 +73,7 @@ class Recordings(_Strict):
 
 
 class Sweep(_Strict):
-    """A handheld sweep of the static scene by one more camera, in chapters."""
+    """A handheld sweep of the static scene by one more camera, in chapters or folders of photographs."""
 
     files: Chapters
 
@@ -159,21 +177,22 @@ class Session(_Strict):
             known: dict[Path, str] = {}
             for camera, chapters in getattr(session.recordings, kind).items():
                 for chapter in chapters:
-                    session._check(chapter, f"the {kind} recording of camera {camera}")
+                    session._check(chapter, f"the {kind} recording of camera {camera}", photographs=kind != "pour")
                     other = known.setdefault((directory / chapter).resolve(), camera)
                     if other != camera or chapters.count(chapter) > 1:
                         raise SplashbenchError(
                             f"{path}: {chapter} is listed twice in [recordings.{kind}]; list every file once"
                         )
         for chapter in session.sweep.files if session.sweep else ():
-            session._check(chapter, "the sweep")
+            session._check(chapter, "the sweep", photographs=True)
         if session.masks.folder is not None:
             session._check(session.masks.folder, "the mask folder", folder=True)
         if session.masks.container_folder is not None:
             session._check(session.masks.container_folder, "the folder of container masks", folder=True)
         return session
 
-    def _check(self, relative: str, what: str, folder: bool = False) -> None:
+    def _check(self, relative: str, what: str, folder: bool = False, photographs: bool = False) -> None:
+        """`relative` must be a file within the session: or a folder instead (`folder`), or either (`photographs`)."""
         root = self._directory.resolve()
         if "\0" in relative:
             raise SplashbenchError(f"{self._directory / DESCRIPTION}: {what} has an unusable name; mend it")
@@ -183,7 +202,12 @@ class Session(_Strict):
                 f"{self._directory / DESCRIPTION}: {relative} ({what}) lies outside the session; "
                 "copy the file into the session's folder"
             )
-        if not (path.is_dir() if folder else path.is_file()):
+        if path.is_dir() and not folder and not photographs:
+            raise SplashbenchError(
+                f"{self._directory / relative} ({what}) is a folder; only video shows the pour: list its files in"
+                f" {DESCRIPTION}"
+            )
+        if not (path.is_dir() if folder else path.is_file() or (photographs and path.is_dir())):
             raise SplashbenchError(
                 f"{self._directory / relative} ({what}) does not exist; restore it or mend {DESCRIPTION}"
             )

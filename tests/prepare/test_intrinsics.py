@@ -132,6 +132,47 @@ def test_false_detections_do_not_move_the_focal_length(detector: BoardDetector) 
     assert abs(found.lens.focal / LENS.focal - 1) < 0.003
 
 
+def test_a_large_board_does_not_hide_a_misread_row(detector: BoardDetector) -> None:
+    # Over its own diagonal the residual looks like lens distortion; in pixels of the image it is none.
+    points = detector.corners
+    pixels = (points - points.min(0)) / np.ptp(points[:, 0]) * 0.9 * WIDTH + 10
+    misread = pixels.copy()
+    misread[:7, 1] -= 46
+    size = (WIDTH, HEIGHT)
+    assert BoardView(np.arange(28), points, pixels).lies_on_a_plane(size)
+    view = BoardView(np.arange(28), points, misread)
+    assert view.homography_residual() == pytest.approx(view.homography_residual_px() / view.diagonal)
+    assert view.homography_residual_px() > 0.02 * WIDTH
+    assert view.homography_residual() < 0.03
+    assert not view.lies_on_a_plane(size)
+
+
+def test_single_misplaced_corners_are_left_out_and_their_views_kept(detector: BoardDetector) -> None:
+    rng = np.random.default_rng(9)
+    views = [ideal_view(detector, LENS, rng) for _ in range(12)]
+    for k in (0, 3, 7):
+        pixels = views[k].pixels.copy()
+        pixels[4] += [3.0, -4.0]
+        views[k] = BoardView(views[k].ids, views[k].points, pixels)
+    found = calibrate_views(views, detector, (WIDTH, HEIGHT), "clip.mp4", 12)
+    assert (found.n_views, found.n_outlier_corners) == (12, 3)
+    assert found.rms_px < 0.1
+    assert abs(found.lens.focal / LENS.focal - 1) < 0.003
+
+
+def test_five_good_views_are_enough_and_their_deviation_says_how_far(detector: BoardDetector) -> None:
+    rng = np.random.default_rng(12)
+    views = [ideal_view(detector, LENS, rng) for _ in range(5)]
+    found = calibrate_views(views, detector, (WIDTH, HEIGHT), "clip.mp4", 5)
+    many = calibrate_views(
+        views + [ideal_view(detector, LENS, rng) for _ in range(25)], detector, (WIDTH, HEIGHT), "clip.mp4", 30
+    )
+    assert abs(found.lens.focal - LENS.focal) < 3 * found.focal_sigma_px
+    assert found.focal_sigma_px > 2 * many.focal_sigma_px
+    with pytest.raises(SplashbenchError, match="usable in 4 of 4 frames, 5 are needed"):
+        calibrate_views(views[:4], detector, (WIDTH, HEIGHT), "clip.mp4", 4)
+
+
 def test_a_blurred_view_is_left_out(detector: BoardDetector) -> None:
     rng = np.random.default_rng(4)
     views = [ideal_view(detector, LENS, rng) for _ in range(20)]
@@ -147,12 +188,19 @@ def test_a_board_that_stays_put_leaves_the_focal_length_open(detector: BoardDete
     found = calibrate_views(views, detector, (WIDTH, HEIGHT), "clip.mp4", 12)
     assert found.rms_px < 0.2
     assert found.coverage < 0.6
+    assert found.focal_sigma_px > 0.005 * LENS.focal
 
 
 def test_too_few_boards_is_one_line_naming_the_clip(detector: BoardDetector) -> None:
     blank = [np.full((HEIGHT, WIDTH, 3), 128, np.uint8)] * 5
     with pytest.raises(SplashbenchError, match=r"GX01\.MP4: the 8x5 ChArUco board is usable in 0 of 5 frames"):
         calibrate(blank, detector, "GX01.MP4")
+
+
+def test_copies_of_one_view_count_once(detector: BoardDetector) -> None:
+    view = ideal_view(detector, LENS, np.random.default_rng(13))
+    with pytest.raises(SplashbenchError, match="usable in 1 of 20 frames"):
+        calibrate_views([view] * 20, detector, (WIDTH, HEIGHT), "clip.mp4", 20)
 
 
 def test_unknown_dictionary_is_refused() -> None:

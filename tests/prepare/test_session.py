@@ -115,6 +115,14 @@ def edit(*keys: str, value: Any = None) -> Callable[[dict[str, Any]], None]:
         (edit("cameras", value=["1", "../x", "3"]), "must consist of letters"),
         (edit("board"), r"needs the \[board\]"),
         (edit("board", "marker_metres", value=0.03), "smaller than square_metres"),
+        (edit("board", "marker_metres"), "ChArUco board needs marker_metres and dictionary; give both, or kind ="),
+        (edit("board", "dictionary"), "ChArUco board needs marker_metres and dictionary"),
+        (edit("board", "kind", value="chessboard"), r"board\.kind"),
+        (edit("board", "kind", value="checkerboard"), "checkerboard has no marker_metres, dictionary or legacy; leave"),
+        (
+            edit("board", value={"kind": "checkerboard", "squares_x": 8, "squares_y": 3, "square_metres": 0.03}),
+            "at least 4 squares each way; count squares, not inner corners",
+        ),
         (edit("board", "colour", value="red"), r"board\.colour"),
         (edit("schema_version", value=2), "schema_version"),
         (edit("timesteps", value=1), "timesteps"),
@@ -137,6 +145,36 @@ def test_faults_are_one_line_naming_the_file(
         Session.open(tmp_path)
     assert str(tmp_path / "session.toml") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_checkerboard_has_no_markers(tmp_path: Path) -> None:
+    data = description()
+    data["board"] = {"kind": "checkerboard", "squares_x": 8, "squares_y": 5, "square_metres": 0.06}
+    board = Session.open(write(tmp_path, data)).board
+    assert board is not None
+    assert board.kind == "checkerboard"
+    assert board.marker_metres is None
+
+
+@pytest.mark.parametrize("kind", ["intrinsics", "static", "sweep"])
+def test_photographs_may_stand_for_video_but_not_for_the_pour(tmp_path: Path, kind: str) -> None:
+    data = description()
+    write(tmp_path, data)
+    (tmp_path / "photographs").mkdir()
+    if kind == "sweep":
+        data["sweep"]["files"] = ["photographs"]
+    else:
+        data["recordings"][kind]["2"] = ["photographs"]
+    (tmp_path / "session.toml").write_text(toml.dumps(data))
+    session = Session.open(tmp_path)
+    paths = session.sweep_paths if kind == "sweep" else session.paths(kind, "2")  # type: ignore[arg-type]
+    assert paths == (tmp_path / "photographs",)
+    data["recordings"]["pour"]["2"] = ["photographs"]
+    (tmp_path / "session.toml").write_text(toml.dumps(data))
+    with pytest.raises(
+        SplashbenchError, match=r"photographs \(the pour recording of camera 2\) is a folder; only video"
+    ):
+        Session.open(tmp_path)
 
 
 def test_a_link_out_of_the_session_is_refused(tmp_path: Path) -> None:
