@@ -81,7 +81,9 @@ class Placement:
         equivalent_turns: 1 where determined, 0 where free.
         cameras: those that decided.
         projections: per camera that decided, overlap and distance of the outlines (see `container_check`).
-        cost_px: RMS distance of the outlines in pixels, occluded ones counted no further than the fit's reach.
+        cost_px: RMS distance of the outlines (of the clicked points) over all of `cameras`, occluded parts counted no
+            further than the fit's reach; pixels of the image, or where a mask is longer than 1000 of them, of the
+            image reduced to that.
         position_sigma, tilt_sigma_degrees: jackknife over the cameras that decided: how far the container's centre
             (scene units) and its vertical axis would lie elsewhere with other such cameras. None for two cameras.
         point_rms_px: per camera, the error of clicked points; empty where none were used.
