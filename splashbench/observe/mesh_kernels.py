@@ -14,6 +14,8 @@ from splashbench.parallel import over_range
 
 # Pixels: neighbouring triangles must not leave a crack between them by rounding.
 _EDGE_SLACK = 1e-7
+# Pixels of a depth image that are worth a thread.
+_FEWEST_PIXELS = 1 << 16
 # Voxels: grid lines are counted beside the nodes, so that they meet no vertex and no edge of a mesh that was built on
 # round numbers.
 _BESIDE = (3.1e-5, 2.3e-5)
@@ -56,7 +58,9 @@ def raster(corners: np.ndarray, height: int, width: int) -> np.ndarray:
     corners: float64 [N, 3, 3], x, y in pixels and 1 / z > 0 of the corners of each triangle, seen from either side.
     """
     depth = np.full((height, width), np.inf, dtype=np.float32)
-    over_range(_raster, height, np.ascontiguousarray(corners, np.float64), depth, smallest=32)
+    # Handing out the parts of a small picture takes longer than drawing it.
+    rows = max(32, _FEWEST_PIXELS // max(width, 1))
+    over_range(_raster, height, np.ascontiguousarray(corners, np.float64), depth, smallest=rows)
     return depth
 
 

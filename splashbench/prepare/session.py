@@ -22,6 +22,7 @@ DESCRIPTION = "session.toml"
 Kind = Literal["pour", "static", "intrinsics"]
 _CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Chapters = Annotated[list[str], Field(min_length=1, max_length=1000)]
 
 
@@ -110,6 +111,43 @@ class Masks(_Strict):
         return self
 
 
+class ContainerPoint(_Strict):
+    """A point of the container's mesh, in its own coordinates, and where cameras see it: pixels of the raw frame."""
+
+    point: tuple[Finite, Finite, Finite]
+    pixels: dict[str, tuple[Finite, Finite]] = Field(min_length=1, max_length=100)
+
+
+class Container(_Strict):
+    """The scanned container: its `mesh` (PLY, GLB or OBJ) and what places it in the scene.
+
+    masks: folder of <camera>.png; `masks.container_folder` where it is not given. points: clicked by hand; where both
+    are there, the points are where the masks' fit begins. metres_per_unit: of the mesh's coordinates. up: the mesh's
+    direction that points up; found where it is not given.
+    """
+
+    mesh: str
+    masks: str | None = None
+    points: list[ContainerPoint] = Field(default_factory=list, max_length=1000)
+    metres_per_unit: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | Literal["unknown"] = 1.0
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
+    transparent: bool = False
+
+    @field_validator("mesh")
+    @classmethod
+    def _is_a_mesh(cls, mesh: str) -> str:
+        from splashbench.scene.container import FORMATS
+
+        if Path(mesh).suffix.lower() not in FORMATS:
+            raise ValueError(f"{mesh!r} is not a mesh that is read; convert it to one of {', '.join(FORMATS)}")
+        return mesh
+
+    @property
+    def scale(self) -> float | None:
+        """Metres per unit of the mesh; None where it is to be found."""
+        return None if self.metres_per_unit == "unknown" else self.metres_per_unit
+
+
 class Session(_Strict):
     """The contents of session.toml, checked against the folder it lies in. Made by `Session.open`."""
 
@@ -125,6 +163,7 @@ class Session(_Strict):
     sweep: Sweep | None = None
     sound: Sound | None = None
     masks: Masks = Field(default_factory=Masks)
+    container: Container | None = None
 
     _directory: Path = PrivateAttr(default=Path())
 
@@ -164,6 +203,22 @@ class Session(_Strict):
             raise ValueError("[recordings.intrinsics] needs the [board] that was filmed; describe it")
         return self
 
+    @model_validator(mode="after")
+    def _container_can_be_placed(self) -> Session:
+        if self.container is None:
+            return self
+        masks, points = self.container.masks, self.container.points
+        if masks is not None and self.masks.container_folder not in (None, masks):
+            raise ValueError("[container] masks and [masks] container_folder name different folders; keep the first")
+        if masks is None and self.masks.container_folder is None and not points:
+            raise ValueError("[container] needs what places its mesh; give masks (a folder of <camera>.png) or points")
+        if points and len(points) < 3:
+            raise ValueError(f"[container] has {len(points)} points, three are needed; click more or leave them out")
+        unknown = [camera for point in points for camera in point.pixels if camera not in self.cameras]
+        if unknown:
+            raise ValueError(f"[container] points name camera {unknown[0]}, which `cameras` does not list")
+        return self
+
     @classmethod
     def open(cls, directory: Path) -> Session:
         """Read and check DIRECTORY/session.toml. Raises SplashbenchError naming whatever is missing or wrong."""
@@ -189,6 +244,10 @@ class Session(_Strict):
             session._check(session.masks.folder, "the mask folder", folder=True)
         if session.masks.container_folder is not None:
             session._check(session.masks.container_folder, "the folder of container masks", folder=True)
+        if session.container is not None:
+            session._check(session.container.mesh, "the container's mesh")
+            if session.container.masks is not None:
+                session._check(session.container.masks, "the folder of container masks", folder=True)
         return session
 
     def _check(self, relative: str, what: str, folder: bool = False, photographs: bool = False) -> None:
@@ -244,5 +303,11 @@ class Session(_Strict):
 
     @property
     def container_folder(self) -> Path | None:
-        """The folder of container masks, where `masks.container_folder` names one."""
-        return None if self.masks.container_folder is None else self._directory / self.masks.container_folder
+        """The folder of container masks, where [container] or [masks] names one."""
+        named = (self.container.masks if self.container else None) or self.masks.container_folder
+        return None if named is None else self._directory / named
+
+    @property
+    def container_mesh(self) -> Path | None:
+        """The container's mesh as it was scanned, where [container] names one."""
+        return None if self.container is None else self._directory / self.container.mesh
