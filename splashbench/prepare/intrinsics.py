@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.board import MIN_CORNERS, BoardView, Detector, collinear, image_size
 from splashbench.prepare.lens import OPENCV_PIXEL_SHIFT, Array, Lens
+from splashbench.prepare.repeatable import one_opencv_thread
 
 MAX_FRAMES_SEARCHED = 150  # evenly spread over the clip; more adds time and near-copies
 MAX_VIEWS = 50
@@ -181,7 +182,10 @@ def _fit(views: list[BoardView], size: tuple[int, int], fixed: int = 0) -> _Fit:
     """
     objects = [_object_points(view) for view in views]
     images = [(view.pixels - OPENCV_PIXEL_SHIFT).astype(np.float32) for view in views]
-    rms, K, distortion, rotations, translations = cv2.calibrateCamera(objects, images, size, None, None, flags=fixed)
+    with one_opencv_thread():
+        rms, K, distortion, rotations, translations = cv2.calibrateCamera(
+            objects, images, size, None, None, flags=fixed
+        )
     errors, per_view = [], []
     for object_points, pixels, rotation, translation in zip(objects, images, rotations, translations):
         projected, jacobian = cv2.projectPoints(object_points, rotation, translation, K, distortion)

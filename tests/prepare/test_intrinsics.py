@@ -239,3 +239,12 @@ def test_real_inverted_board_is_detected_and_its_poor_coverage_flagged(test_data
     assert found.rms_px < 0.4
     failed = {gate.name for gate in intrinsics_gates({"0": found}) if not gate.passed}
     assert "board_coverage" in failed
+
+
+def test_the_same_views_give_the_same_bits(detector: BoardDetector) -> None:
+    """OpenCV's own threads would not: they add up in the order in which they finish."""
+    lens = Lens(1920, 1080, np.array([[1500.0, 0, 960], [0, 1500, 540], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0, 0]))
+    rng = np.random.default_rng(5)
+    views = [ideal_view(detector, lens, rng) for _ in range(30)]
+    found = [calibrate_views(views, detector, (1920, 1080), "clip", 30).lens for _ in range(3)]
+    assert len({(lens.K.tobytes(), lens.distortion.tobytes()) for lens in found}) == 1
