@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.container_stage import PlacedContainer
 from splashbench.prepare.intrinsics import Calibration
 from splashbench.prepare.masks import MaskHealth
 from splashbench.prepare.metric import MetricFrame
@@ -150,6 +151,40 @@ def mask_gates(health: Mapping[str, MaskHealth], n_frames: int) -> list[Gate]:
         Gate("masks_failed", failed, 0, "at most", "flooded or flickering masks over all cameras"),
         Gate("masks_empty", empty, 0.2, "at most", f"share of empty masks, camera {most}"),
     ]
+
+
+def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -> list[Gate]:
+    """How well the placed mesh covers its masks, of the cameras that placed it and of those that did not."""
+    seen, placement = placed.projections, placed.placement
+    fitted = [camera for camera in train if camera in seen]
+    held_out = [camera for camera in seen if camera not in fitted]
+    gates = []
+    if fitted:
+        # The median: a hand may hide the container from one camera.
+        overlap = float(np.median([seen[camera].iou for camera in fitted]))
+        gates.append(
+            Gate("container_iou", overlap, 0.95, "at least", "projected mesh and mask, median of training views")
+        )
+        gates.append(
+            Gate("container_is_the_container", overlap, 0.8, "at least", "as above; below it, it is another mesh", True)
+        )
+        known = {camera: seen[camera].contour_median_px for camera in fitted}
+        medians = {camera: np.inf if found is None else found for camera, found in known.items()}
+        worst = max(fitted, key=medians.__getitem__)
+        detail = f"px between projected and masked outline, median, camera {worst}"
+        gates.append(Gate("container_outline", medians[worst], max(1.5, width / 1000), "at most", detail))
+    if held_out:
+        worst = min(held_out, key=lambda camera: seen[camera].iou)
+        detail = f"projected mesh and mask, held-out camera {worst}"
+        gates.append(Gate("container_held_out", seen[worst].iou, 0.9, "at least", detail))
+    if placement.position_sigma is not None:
+        gates.append(
+            Gate("container_sigma", placement.position_sigma, 2e-3, "at most", "m, its centre, by leaving out cameras")
+        )
+    up = np.asarray(placement.up)
+    tilt = float(np.degrees(np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))))
+    gates.append(Gate("container_upright", tilt, 2.0, "at most", "degrees between its axis and the scene's up"))
+    return gates
 
 
 def source_gate(share: Mapping[str, float]) -> Gate:

@@ -16,7 +16,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray, write_png
 from splashbench.prepare.background import BackgroundMasks
 from splashbench.prepare.crop import Box, bounding_box, crop_window
-from splashbench.prepare.masks import FolderMasks, Mask, MaskProvider, mask_health, read_raw_mask
+from splashbench.prepare.masks import FolderMasks, Mask, MaskProvider, mask_health
 from splashbench.prepare.preparation import MaskRecord
 from splashbench.prepare.sync import ClockFit
 from splashbench.prepare.undistort import Undistorter
@@ -116,18 +116,3 @@ class MaskStore:
 
 def _file(folder: Path, t: int) -> Path:
     return folder / f"{t:06d}.png"
-
-
-def container_masks(
-    folder: Path | None, undistorters: Mapping[str, Undistorter], windows: Mapping[str, Box]
-) -> dict[str, Mask] | None:
-    """Container masks as the scene holds them, from FOLDER/<camera>.png in raw geometry; None where there are none."""
-    if folder is None:
-        return None
-    found = {}
-    for camera, undistorter in undistorters.items():
-        path = folder / f"{camera}.png"
-        if path.is_file():
-            raw = read_raw_mask(path, undistorter.lens.width, undistorter.lens.height)
-            found[camera] = windows[camera].cut(undistorter.mask(raw))
-    return found or None

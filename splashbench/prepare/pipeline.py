@@ -9,7 +9,7 @@ succeeded; its bytes do not depend on how often that was interrupted.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, sha256_file, write_json, write_text
+from splashbench.prepare import container_stage, listening, masking, metric, motion, rig, sampling, sync
 from splashbench.prepare import gates as g
-from splashbench.prepare import listening, masking, metric, motion, rig, sampling, sync
+from splashbench.prepare.container_stage import PlacedContainer
 from splashbench.prepare.crop import Box
 from splashbench.prepare.intrinsics import Calibration
 from splashbench.prepare.lens import Lens
@@ -110,6 +111,7 @@ class _Run:
     options: Options
     store: StageStore
     thumbnails: dict[str, list[Image]] = field(default_factory=dict)
+    overlays: dict[str, Image] = field(default_factory=dict)
 
     def into(self, directory: Path) -> Preparation:
         """Run all stages; the scene is written into `directory`."""
@@ -139,6 +141,15 @@ class _Run:
         g.require(gates, str(session.directory))
 
         undistorters = {camera: Undistorter(lens) for camera, lens in lenses.items()}
+        whole = {
+            camera: Camera(camera, lens.width, lens.height, lens.K, placed.w2c[camera])
+            for camera, lens in lenses.items()
+        }
+        container_masks = container_stage.container_masks(session.container_folder, undistorters)
+        container = self._container(whole, container_masks, undistorters)
+        if container is not None:
+            gates += g.container_gates(container, session.train, lenses[cameras[0]].width)
+            g.require(gates, str(session.container_mesh))
         record, store = self._masks(sampled, undistorters, clocks, interval.start)
         windows = store.windows(undistorters, self.options.crop)
         gates += g.mask_gates(record.health, len(sampled.times))
@@ -148,18 +159,22 @@ class _Run:
             write_scene(
                 directory,
                 cameras={
-                    camera: _cropped(camera, lens, placed.w2c[camera], windows[camera])
-                    for camera, lens in lenses.items()
+                    name: camera.cropped(box.x0, box.y0, box.width, box.height)
+                    for (name, camera), box in zip(whole.items(), (windows[name] for name in whole))
                 },
                 train=session.train,
                 test=session.test,
                 n_frames=len(sampled.times),
-                frames=self._frames(sampled, undistorters, store, windows),
-                meta=self._meta(sampled, windows, record.provider),
+                frames=self._frames(
+                    sampled, undistorters, store, windows, self._overlays(container, whole, container_masks)
+                ),
+                meta=self._meta(sampled, windows, record.provider, container),
                 initial_points=metric.initial_points(placed),
-                container_masks=masking.container_masks(session.container_folder, undistorters, windows),
+                container_masks={name: windows[name].cut(mask) for name, mask in container_masks.items()},
                 image_format=self.options.image_format,
             )
+            if container is not None:
+                container_stage.put_into_scene(session, directory)
         return Preparation(
             session=session,
             heard=heard,
@@ -172,11 +187,13 @@ class _Run:
             motion=interval,
             sampling=sampled,
             masks=record,
+            container=container,
             windows=windows,
             cropped=self.options.crop,
             gates=gates,
             stages=dict(self.store.records),
             thumbnails=self.thumbnails,
+            overlays=self.overlays,
         )
 
     @cached_property
@@ -275,6 +292,39 @@ class _Run:
         distance, shift = sync.sound_paths(positions, source, self.session.reference)
         return SoundPaths(source, given is not None, distance, shift)
 
+    def _container(
+        self, whole: Mapping[str, Camera], masks: Mapping[str, Mask], undistorters: Mapping[str, Undistorter]
+    ) -> PlacedContainer | None:
+        """The container's mesh in the scene; `whole`: cameras of uncropped frames. None where the session has none."""
+        if self.session.container is None:
+            return None
+        inputs = {
+            "files": facts_of(container_stage.container_files(self.session)),
+            "described": self.session.container,
+            "train": self.session.train,
+            "cameras": {name: [camera.K, camera.w2c] for name, camera in whole.items()},
+            "lenses": {name: undistorter.lens for name, undistorter in undistorters.items()},
+        }
+        return self.store.result(
+            "container",
+            PlacedContainer,
+            inputs,
+            lambda: container_stage.place_container(self.session, list(whole.values()), masks, undistorters),
+        )
+
+    def _overlays(
+        self, container: PlacedContainer | None, whole: Mapping[str, Camera], masks: Mapping[str, Mask]
+    ) -> Callable[[str, Image], None]:
+        """Keeps, given a camera and an undistorted whole frame of it, the placed container drawn on it."""
+        if container is None:
+            return lambda camera, image: None
+        mesh, placed = container_stage.container_mesh(self.session), container
+
+        def keep(camera: str, image: Image) -> None:
+            self.overlays[camera] = container_stage.overlay_image(mesh, placed, whole[camera], masks.get(camera), image)
+
+        return keep
+
     def _masks(
         self,
         sampled: sampling.Sampling,
@@ -316,13 +366,23 @@ class _Run:
             return self.session.mask_folder
         return None if self.options.masks == "background" else Path(self.options.masks)
 
-    def _meta(self, sampled: sampling.Sampling, windows: Mapping[str, Box], provider: str) -> SceneMeta:
+    def _meta(
+        self,
+        sampled: sampling.Sampling,
+        windows: Mapping[str, Box],
+        provider: str,
+        container: PlacedContainer | None,
+    ) -> SceneMeta:
+        mesh = self.session.container_mesh
         return SceneMeta(
             name=self.session.name,
             times=sampled.times.tolist(),
             camera_times={camera: times.tolist() for camera, times in sampled.camera_times.items()},
             metres_per_unit=1.0,
             gravity=metric.GRAVITY,
+            container_mesh=None if mesh is None else container_stage.name_in_scene(mesh),
+            container_pose=None if container is None else container.placement.pose.tolist(),
+            container_transparent=None if self.session.container is None else self.session.container.transparent,
             provenance={
                 "made_by": "splashbench prepare",
                 "session_sha256": sha256_file(self.session.directory / DESCRIPTION),
@@ -339,6 +399,7 @@ class _Run:
         undistorters: Mapping[str, Undistorter],
         store: masking.MaskStore,
         windows: Mapping[str, Box],
+        keep_overlay: Callable[[str, Image], None],
     ) -> Iterator[tuple[str, int, Image, Mask]]:
         """The scene's images and masks, camera by camera; a few are kept as thumbnails in passing."""
         shown = set(np.linspace(0, len(sampled.times) - 1, THUMBNAILS).round().astype(int).tolist())
@@ -346,12 +407,10 @@ class _Run:
             window = windows[camera]
             kept = self.thumbnails.setdefault(camera, [])
             for t, (_, raw) in enumerate(recording.frames(sampled.indices[camera].tolist())):
-                image, mask = window.cut(undistorters[camera].image(raw)), window.cut(store.read(camera, t))
+                whole = undistorters[camera].image(raw)
+                if t == 0:
+                    keep_overlay(camera, whole)
+                image, mask = window.cut(whole), window.cut(store.read(camera, t))
                 if t in shown:
                     kept.append(outlined(image, mask))
                 yield camera, t, image, mask
-
-
-def _cropped(name: str, lens: Lens, w2c: NDArray[np.float64], window: Box) -> Camera:
-    camera = Camera(name, lens.width, lens.height, lens.K, w2c)
-    return camera.cropped(window.x0, window.y0, window.width, window.height)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.prepare.container_stage import PlacedContainer
 from splashbench.prepare.crop import Box
 from splashbench.prepare.gates import Gate
 from splashbench.prepare.intrinsics import Calibration
@@ -53,11 +54,13 @@ class Preparation:
     motion: MotionInterval
     sampling: Sampling
     masks: MaskRecord
+    container: PlacedContainer | None
     windows: dict[str, Box]
     cropped: bool
     gates: list[Gate]
     stages: dict[Stage, StageRecord]
     thumbnails: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict, repr=False)
+    overlays: dict[str, NDArray[np.uint8]] = field(default_factory=dict, repr=False)
 
     @property
     def warnings(self) -> list[Gate]:
@@ -116,6 +119,7 @@ class Preparation:
                 "empty": {camera: health.empty for camera, health in self.masks.health.items()},
                 "failed": {camera: health.failed for camera, health in self.masks.health.items()},
             },
+            "container": None if self.container is None else _container(self.container),
             "crop": {
                 "applied": self.cropped,
                 "windows": {camera: [box.x0, box.y0, box.x1, box.y1] for camera, box in self.windows.items()},
@@ -148,6 +152,30 @@ def _recording(facts: VideoInfo) -> dict[str, Any]:
         "codec": facts.codec,
         "timecode": facts.timecode,
         "audio_minus_video_s": facts.audio_minus_video_s,
+    }
+
+
+def _container(placed: PlacedContainer) -> dict[str, Any]:
+    placement = placed.placement
+    return {
+        "pose": placement.pose.tolist(),
+        "metres_per_unit": placement.scale,
+        "up_axis": placement.up_axis,
+        "up_is_ambiguous": placement.up_is_ambiguous,
+        "turn": placement.turn,
+        "equivalent_turns": placement.equivalent_turns,
+        "decided_by": list(placement.cameras),
+        "position_sigma_m": placement.position_sigma,
+        "tilt_sigma_degrees": placement.tilt_sigma_degrees,
+        "points_rms_px": placement.point_rms_px or None,
+        "projections": {
+            camera: {
+                "iou": seen.iou,
+                "outline_rms_px": seen.contour_rms_px,
+                "outline_median_px": seen.contour_median_px,
+            }
+            for camera, seen in placed.projections.items()
+        },
     }
 
 

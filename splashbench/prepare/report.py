@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from splashbench.prepare.intrinsics import COVERAGE_CELLS
 
 if TYPE_CHECKING:
+    from splashbench.prepare.container_stage import PlacedContainer
     from splashbench.prepare.preparation import Preparation
 
 OUTLINE_COLOUR = (255, 40, 40)
@@ -51,6 +52,7 @@ def html_report(preparation: Preparation) -> str:
         *_section("Gates", _gates(preparation)),
         *_section(f"Masks ({preparation.masks.provider})", _masks(preparation)),
         *_section("Cameras", _layout(preparation)),
+        *(_section("Container", _container(preparation.container, preparation)) if preparation.container else []),
         *_section("Lenses", _lenses(preparation)),
         *_section("Clocks", _clocks(preparation)),
         *_section("Motion interval", _list(preparation.motion.reasons)),
@@ -185,6 +187,41 @@ def _layout(preparation: Preparation) -> list[str]:
         " Blue: training views; orange: held-out views."
     )
     return [_figure(figure), f'<p class="note">{html.escape(text)}</p>']
+
+
+def _container(placed: PlacedContainer, preparation: Preparation) -> list[str]:
+    """Where the mesh lies: its projected outline (blue) on the mask's (amber), and how well they agree."""
+    placement = placed.placement
+    turns = {
+        "determined": "Its turn about the vertical axis is determined.",
+        "repeats": f"{placement.equivalent_turns} turns about the vertical axis look the same; the nearest was taken.",
+        "free": "It looks the same however turned about the vertical axis; it is turned as the mesh came.",
+    }
+    rows = [
+        [
+            camera,
+            "held out" if camera in preparation.session.test else "training",
+            f"{seen.iou:.4f}",
+            "unknown" if seen.contour_rms_px is None else f"{seen.contour_rms_px:.2f}",
+            "unknown" if seen.contour_median_px is None else f"{seen.contour_median_px:.2f}",
+        ]
+        for camera, seen in placed.projections.items()
+    ]
+    sheet = [
+        f'<figure><img alt="camera {html.escape(camera)}" src="{_image_uri(image)}">'
+        f"<figcaption>camera {html.escape(camera)}</figcaption></figure>"
+        for camera, image in preparation.overlays.items()
+    ]
+    ambiguous = " Another of its axes could be up as well; give up in [container]." if placement.up_is_ambiguous else ""
+    header = ["camera", "view", "IoU", "outline RMS [px]", "outline median [px]"]
+    return [
+        f'<p class="note">{turns[placement.turn]}{ambiguous} Only training views placed it. Blue: the mesh projected;'
+        " amber: the mask.</p>",
+        _table(header, rows),
+        '<div class="sheet">',
+        *sheet,
+        "</div>",
+    ]
 
 
 def _lenses(preparation: Preparation) -> list[str]:

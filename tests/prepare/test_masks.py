@@ -11,9 +11,9 @@ import pytest
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
 from splashbench.prepare.background import Background, BackgroundMasks, segment
+from splashbench.prepare.container_stage import container_masks
 from splashbench.prepare.crop import Box
 from splashbench.prepare.lens import Lens
-from splashbench.prepare.masking import container_masks
 from splashbench.prepare.masks import FolderMasks, mask_health
 from splashbench.prepare.undistort import Undistorter
 
@@ -156,13 +156,13 @@ def test_pincushion_corners_have_no_source_and_no_mask() -> None:
     assert not image[0, 0].any()
 
 
-def test_container_masks_are_undistorted_and_cut_like_the_images(tmp_path: Path) -> None:
+def test_container_masks_are_undistorted(tmp_path: Path) -> None:
     K = np.array([[80.0, 0, 50], [0, 80.0, 40], [0, 0, 1]])
     undistorter = Undistorter(Lens(100, 80, K, np.zeros(5)))
     raw = np.zeros((80, 100), np.uint8)
     raw[20:60, 30:70] = 255
     write_png(tmp_path / "1.png", raw)
-    found = container_masks(tmp_path, {"1": undistorter, "2": undistorter}, {"1": Box(20, 10, 60, 42)})
-    assert found is not None
+    found = container_masks(tmp_path, {"1": undistorter, "2": undistorter})
     assert set(found) == {"1"}
-    assert (found["1"] == (raw[10:42, 20:60] > 0)).all()
+    assert (found["1"] == (raw > 0)).all()
+    assert container_masks(None, {"1": undistorter}) == {}
