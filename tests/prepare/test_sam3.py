@@ -21,6 +21,9 @@ from splashbench.prepare.sam3 import Sam3Masks
 from splashbench.prepare.sam3_checkpoint import Sam3Checkpoint
 from splashbench.prepare.session import Click, Masks
 
+# transformers for Python 3.10 compiles in the old way.
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
+
 WIDTH, HEIGHT = 90, 60
 SIZE, PATCH = 56, 14
 GRID = SIZE // PATCH
