@@ -20,7 +20,7 @@ from splashbench.processes import Terminated, terminable
 from splashbench.version import __version__
 
 #: In the order of the work: session, scene, method, submission, result.
-COMMANDS = ("demo", "synth", "prepare", "scene", "methods", "run", "check", "score", "leaderboard", "study")
+COMMANDS = ("demo", "synth", "prepare", "masks", "scene", "methods", "run", "check", "score", "leaderboard", "study")
 
 _EPILOG = """\
 the usual order:

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from splashbench.prepare.arrays import Floats
+
+Array = Floats
 
 # Pixels: standard deviation of the blur, and the strip along the image's border without an outline.
 _BLUR = 1.0

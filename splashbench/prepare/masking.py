@@ -18,6 +18,7 @@ from splashbench.prepare.background import BackgroundMasks
 from splashbench.prepare.crop import Box, bounding_box, crop_window
 from splashbench.prepare.masks import FolderMasks, Mask, MaskProvider, mask_health
 from splashbench.prepare.preparation import MaskRecord
+from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.sync import ClockFit
 from splashbench.prepare.undistort import Undistorter
 from splashbench.prepare.video import Recording
@@ -28,9 +29,19 @@ QUIET_MARGIN_S = 0.1
 
 
 def choose_provider(
-    folder: Path | None, pour: Mapping[str, Recording], clocks: Mapping[str, ClockFit], motion_start: float
+    session: Session,
+    asked: str | None,
+    pour: Mapping[str, Recording],
+    clocks: Mapping[str, ClockFit],
+    motion_start: float,
 ) -> MaskProvider:
-    """Masks from a folder where one is given, else by subtraction of what was there before the motion."""
+    """Where masks come from: as `asked` ("background" or a folder), else as the session says.
+
+    Raises SplashbenchError where the folder or the checkpoint is not there, or clicks lie outside the recording.
+    """
+    folder = session.mask_folder if asked is None else None if asked == "background" else Path(asked)
+    if asked is None and session.masks.provider == "sam3":
+        return _sam3(session, pour)
     if folder is not None:
         if not folder.is_dir():
             raise SplashbenchError(f"{folder} is not a folder of masks; give one, or --masks background")
@@ -42,6 +53,29 @@ def choose_provider(
     }
     sources = {camera: str(recording.paths[0]) for camera, recording in pour.items()}
     return BackgroundMasks(lambda camera, indices: pour[camera].frames(indices), quiet, sources)
+
+
+def _sam3(session: Session, pour: Mapping[str, Recording]) -> MaskProvider:
+    from splashbench.prepare.sam3 import Sam3Masks
+
+    described = session.masks
+    assert described.checkpoint is not None
+    for camera, clicks in described.points.items():
+        count = len(pour[camera].frame_times)
+        latest = max(click.frame for click in clicks)
+        if latest >= count:
+            raise SplashbenchError(
+                f"{session.directory / DESCRIPTION}: [masks.points] has a click in frame {latest} of camera {camera},"
+                f" whose pour has {count}; frames count from 0"
+            )
+    return Sam3Masks(
+        lambda camera, indices: pour[camera].frames(indices),
+        session.directory / described.checkpoint,
+        {camera: str(recording.paths[0]) for camera, recording in pour.items()},
+        text=described.text,
+        points=described.points,
+        confidence=described.confidence,
+    )
 
 
 def quiet_frames(recording: Recording, motion_start: float) -> list[int]:

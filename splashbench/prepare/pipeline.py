@@ -332,7 +332,7 @@ class _Run:
         clocks: Mapping[str, ClockFit],
         start: float,
     ) -> tuple[masking.MaskRecord, masking.MaskStore]:
-        provider = masking.choose_provider(self._mask_folder(), self.pour, clocks, start)
+        provider = masking.choose_provider(self.session, self.options.masks, self.pour, clocks, start)
         found = {}
         for camera in track(self.session.cameras, f"masks ({provider.name})"):
             indices = sampled.indices[camera].tolist()
@@ -359,12 +359,6 @@ class _Run:
             )
         store = masking.MaskStore(found)
         return store.record(provider.name, undistorters), store
-
-    def _mask_folder(self) -> Path | None:
-        """The folder of masks to use; None for background subtraction."""
-        if self.options.masks is None:
-            return self.session.mask_folder
-        return None if self.options.masks == "background" else Path(self.options.masks)
 
     def _meta(
         self,

@@ -94,14 +94,33 @@ class Sound(_Strict):
         return source
 
 
-class Masks(_Strict):
-    """Where liquid masks come from: `background` subtraction, or a `folder` of <camera>/<source frame:06d>.png.
+class Click(_Strict):
+    """A point that somebody marked on a raw frame of the pour: on liquid, or on what is none.
 
+    frame: source frame, from 0 over all chapters; x, y: pixels from the left and from the top.
+    """
+
+    frame: int = Field(ge=0, lt=10_000_000)
+    x: float = Field(ge=0, lt=100_000)
+    y: float = Field(ge=0, lt=100_000)
+    liquid: bool = True
+
+
+class Masks(_Strict):
+    """Where liquid masks come from: `background` subtraction, a `folder` of <camera>/<source frame:06d>.png, or `sam3`.
+
+    checkpoint: folder of a SAM3 checkpoint, from the session's folder; being large and shared, it may lie outside.
+    text, points: what SAM3 is asked for, in words and by clicks per camera; text = "" leaves the words out.
+    confidence: the least score of what the words find.
     container_folder: folder of <camera>.png, masks of the container; optional.
     """
 
-    provider: Literal["background", "folder"] = "background"
+    provider: Literal["background", "folder", "sam3"] = "background"
     folder: str | None = None
+    checkpoint: str | None = Field(default=None, min_length=1, max_length=4096)
+    text: str = Field(default="liquid", max_length=200)
+    points: dict[str, Annotated[list[Click], Field(min_length=1, max_length=1000)]] = Field(default_factory=dict)
+    confidence: float = Field(default=0.5, ge=0, lt=1)
     container_folder: str | None = None
 
     @model_validator(mode="after")
@@ -109,6 +128,29 @@ class Masks(_Strict):
         if (self.provider == "folder") != (self.folder is not None):
             raise ValueError('folder must be given with provider = "folder", and only then')
         return self
+
+    @model_validator(mode="after")
+    def _prompts_go_with_sam3(self) -> Masks:
+        if (self.provider == "sam3") != (self.checkpoint is not None):
+            raise ValueError('checkpoint must be given with provider = "sam3", and only then')
+        given = self.model_fields_set & {"text", "points", "confidence"}
+        if self.provider != "sam3" and given:
+            raise ValueError(f'{min(given)} is for provider = "sam3" only')
+        if self.provider == "sam3" and not self.text.strip() and not self.points:
+            raise ValueError("text is empty and there are no points; say what to look for")
+        if self.checkpoint is not None and "\0" in self.checkpoint:
+            raise ValueError("checkpoint has an unusable name")
+        return self
+
+    @field_validator("points")
+    @classmethod
+    def _every_frame_clicked_has_liquid(cls, points: dict[str, list[Click]]) -> dict[str, list[Click]]:
+        for camera, clicks in points.items():
+            wet = {click.frame for click in clicks if click.liquid}
+            dry = {click.frame for click in clicks} - wet
+            if dry:
+                raise ValueError(f"camera {camera} has no click on liquid in frame {min(dry)}; add one, or drop it")
+        return points
 
 
 class ContainerPoint(_Strict):
@@ -187,6 +229,9 @@ class Session(_Strict):
 
     @model_validator(mode="after")
     def _cameras_are_complete(self) -> Session:
+        clicked = [camera for camera in self.masks.points if camera not in self.cameras]
+        if clicked:
+            raise ValueError(f"[masks.points] names camera {clicked[0]}, which `cameras` does not list")
         if sorted(self.train + self.test) != sorted(self.cameras):
             raise ValueError("train and test must name every one of `cameras` exactly once between them")
         for kind in ("pour", "static", "intrinsics"):

@@ -1,0 +1,156 @@
+"""`splashbench masks compare|sheet`: raw against refined masks in the paper's figures, and masks for a person's eye."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splashbench.cli.output import add_json, emit, say, table
+
+if TYPE_CHECKING:
+    from splashbench.prepare.mask_comparison import MaskChange
+
+_EPILOG = """\
+examples:
+  splashbench masks compare sam3_masks scenes/bowl_001 --out comparison
+  splashbench masks compare scenes_raw scenes_refined        a folder of scenes each: per scene and overall
+  splashbench masks sheet scenes/bowl_001 --out sheet.png
+  splashbench masks sheet sam3_masks --images frames --out sheet.png
+
+Masks are those of a scene (its seg/), or a folder of <camera>/<frame>.png, white where there is liquid.
+"""
+
+_MOST_COLUMNS = 40
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = subparsers.add_parser(
+        "masks",
+        help="compare liquid masks, or look them over",
+        description="Compare two sets of liquid masks as the paper does, or draw a contact sheet of one.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", metavar="compare|sheet", required=True)
+    comparing = actions.add_parser(
+        "compare",
+        help="raw against refined masks",
+        description="IoU mean and median, shares of the union added and removed, and empty raw masks, per camera,"
+        " per scene and overall. A frame without a file has no liquid.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    comparing.add_argument("raw", type=Path, metavar="RAW", help="scene, folder of masks, or folder of either")
+    comparing.add_argument("refined", type=Path, metavar="REFINED", help="the same, to compare with")
+    comparing.add_argument(
+        "--out", type=Path, metavar="DIR", help="write masks.csv, summary.csv and a picture per scene into this folder"
+    )
+    add_json(comparing)
+    comparing.set_defaults(handler=compare)
+    drawing = actions.add_parser(
+        "sheet",
+        help="a contact sheet to judge masks by eye",
+        description="Cameras in rows, instants in columns, outlines on the images; masks that are empty or cannot be"
+        " right are framed in red with the reason.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    drawing.add_argument("masks", type=Path, metavar="SCENE_OR_FOLDER", help="scene, or folder of masks")
+    drawing.add_argument("--out", type=Path, metavar="SHEET.png", required=True, help="the picture to be written")
+    drawing.add_argument(
+        "--images", type=Path, metavar="FOLDER", help="<camera>/<frame>.png or .jpg; default: the scene's, else black"
+    )
+    drawing.add_argument("--columns", type=_columns, default=8, metavar="N", help="instants to show (default: 8)")
+    add_json(drawing)
+    drawing.set_defaults(handler=sheet)
+
+
+def _columns(text: str) -> int:
+    if not (text.isdecimal() and 1 <= int(text) <= _MOST_COLUMNS):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {_MOST_COLUMNS}")
+    return int(text)
+
+
+def compare(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench masks compare`."""
+    from splashbench.files import files_together, require_folder_place
+    from splashbench.prepare.mask_comparison import change_rows, compare_folders
+
+    if arguments.out is not None:
+        require_folder_place(arguments.out)
+    comparisons = list(compare_folders(arguments.raw, arguments.refined))
+    rows = change_rows(comparisons)
+    header = ["scene", "camera", "masks", "IoU mean", "median", "added", "removed", "raw empty", "touched", "coverage"]
+    print_table = print if not arguments.json else say
+    print_table(table(header, [_row(*key, change) for key, change in rows.items()]))
+    if arguments.out is not None:
+        from splashbench.prepare.mask_comparison_report import write_report
+
+        with files_together(arguments.out) as staging:
+            names = write_report(comparisons, rows, staging)
+        say(f"wrote {', '.join(names)} in {arguments.out}")
+    if arguments.json:
+        figures = [
+            {
+                "scene": scene,
+                "camera": camera,
+                **{key: None if math.isnan(value) else value for key, value in asdict(change).items()},
+            }
+            for (scene, camera), change in rows.items()
+        ]
+        emit({"raw": str(arguments.raw), "refined": str(arguments.refined), "rows": figures})
+    return 0
+
+
+def _row(scene: str, camera: str, change: MaskChange) -> list[str]:
+    def share(value: float, digits: int = 1) -> str:
+        return "-" if math.isnan(value) else f"{value:.{digits}%}"
+
+    def figure(value: float) -> str:
+        return "-" if math.isnan(value) else f"{value:.3f}"
+
+    return [
+        scene,
+        camera,
+        str(change.n_masks),
+        figure(change.mean_iou),
+        figure(change.median_iou),
+        share(change.added_share),
+        share(change.removed_share),
+        share(change.empty_share),
+        share(change.touched_share, 2),
+        f"{share(change.raw_coverage, 2)} to {share(change.refined_coverage, 2)}",
+    ]
+
+
+def sheet(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench masks sheet`."""
+    from splashbench.errors import SplashbenchError
+    from splashbench.files import require_file_place, write_png
+    from splashbench.prepare.mask_comparison import find_mask_sets
+    from splashbench.prepare.mask_sheet import sheet_of_set
+
+    if arguments.out.suffix.lower() != ".png":
+        raise SplashbenchError(f"{arguments.out} does not end in .png; name the picture so")
+    require_file_place(arguments.out)
+    if arguments.images is not None and not arguments.images.is_dir():
+        raise SplashbenchError(f"{arguments.images} is not a folder; give that of <camera>/<frame>.png or .jpg")
+    sets = find_mask_sets(arguments.masks)
+    if len(sets) > 1:
+        raise SplashbenchError(f"{arguments.masks} holds {len(sets)} scenes; give one, such as {sets[0].folder}")
+    picture, faults, remarks = sheet_of_set(sets[0], arguments.columns, arguments.images)
+    write_png(arguments.out, picture)
+    for remark in remarks:
+        say(f"note: {remark}")
+    for camera, found in faults.items():
+        for t, reason in found.items():
+            say(f"camera {camera}, frame {t}: {reason}")
+    say(f"wrote {arguments.out}: {sum(map(len, faults.values()))} masks empty or failed")
+    if arguments.json:
+        listed = {camera: {str(t): reason for t, reason in found.items()} for camera, found in faults.items()}
+        emit({"sheet": str(arguments.out), "faults": listed, "notes": remarks})
+    return 0
