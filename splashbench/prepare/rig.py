@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare import metric, poses
-from splashbench.prepare.board import BoardDetector
+from splashbench.prepare import metric, poses, scale
+from splashbench.prepare.board import BoardDetector, BoardView
 from splashbench.prepare.intrinsics import Calibration, calibrate, focal_guess, frames_to_search
 from splashbench.prepare.lens import Lens
+from splashbench.prepare.marker import MarkerDetector
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.video import Recording
 from splashbench.progress import track
@@ -39,6 +41,7 @@ class RigRecordings:
         self.boards = {camera: Recording(session.paths("intrinsics", camera)) for camera in session.cameras}
         self.static = {camera: Recording(session.paths("static", camera)) for camera in session.cameras}
         self.sweep = Recording(session.sweep_paths) if session.sweep_paths else None
+        self._sharpness: list[float] | None = None  # of all frames of the sweep, once they have been looked at
 
     def calibrations(self) -> dict[str, Calibration]:
         """Every camera's lens from its board clip."""
@@ -61,12 +64,13 @@ class RigRecordings:
             images[camera] = poses.static_image([frame for _, frame in recording.frames(indices)])
         return images
 
-    def sweep_images(self) -> list[Image]:
-        """The sharpest frames of the sweep, spread over it; none where there is no sweep."""
+    def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> list[Image]:
+        """The `count` sharpest frames of the sweep, spread over it; none where there is no sweep."""
         if self.sweep is None:
             return []
-        sharpness = [poses.sharpness_of(luma) for _, luma in self.sweep.luma(SHARPNESS_WIDTH)]
-        chosen = poses.sharpest_per_bin(sharpness, poses.SWEEP_FRAMES)
+        if self._sharpness is None:
+            self._sharpness = [poses.sharpness_of(luma) for _, luma in self.sweep.luma(SHARPNESS_WIDTH)]
+        chosen = poses.sharpest_per_bin(self._sharpness, count)
         return [frame for _, frame in self.sweep.frames(chosen)]
 
     def check_sizes(self, lenses: Mapping[str, Lens], others: Mapping[str, Recording]) -> None:
@@ -92,6 +96,34 @@ def find_poses(
     return poses.estimate_poses(static, lenses, sweep, work, focal_guess(sweep, detector))
 
 
+def solve_poses(
+    static: Mapping[str, Image],
+    sweep_images: Callable[[int], list[Image]],
+    lenses: Mapping[str, Lens],
+    detector: BoardDetector,
+    work: Path,
+) -> tuple[poses.Poses, list[Image]]:
+    """Structure from motion of the static scene, and the frames of the sweep that it used.
+
+    `sweep_images`: the sweep's sharpest frames by their number (`RigRecordings.sweep_images`). Where they do not bridge
+    the fixed cameras, twice as many are tried, and `Poses.attempts` begins with that. Raises SplashbenchError naming
+    the cameras that could not be posed.
+    """
+    sweep = sweep_images(poses.SWEEP_FRAMES)
+    first, second = work / "first", work / "second"
+    first.mkdir()
+    try:
+        return find_poses(static, sweep, lenses, detector, first), sweep
+    except SplashbenchError as error:
+        more = sweep_images(2 * poses.SWEEP_FRAMES)
+        if len(more) <= len(sweep):
+            raise
+        second.mkdir()
+        found = find_poses(static, more, lenses, detector, second)
+        failed = f"{len(sweep)} frames of the sweep: {error}"
+        return replace(found, attempts=(failed, *found.attempts)), more
+
+
 def find_metres(
     static: Mapping[str, Image],
     sweep: Sequence[Image],
@@ -100,8 +132,51 @@ def find_metres(
     detector: BoardDetector,
 ) -> metric.MetricFrame:
     """The scene frame from the board in the static pictures and in the sweep."""
+    return metric.align(_sightings(static, sweep, lenses, found, detector.detect_true), detector)
+
+
+def find_frame(
+    static: Mapping[str, Image],
+    sweep: Sequence[Image],
+    lenses: Mapping[str, Lens],
+    found: poses.Poses,
+    session: Session,
+    detector: BoardDetector | None,
+    container: scale.Upright | None = None,
+) -> scale.SceneFrame:
+    """The scene frame from whatever the session has: board, marker, measured distance (precedence: see `scale`).
+
+    `detector`: of a ChArUco board, None where the board is another, whose corners have no names and so cannot be told
+    apart from other sides. `container`: where its mesh was placed. Raises SplashbenchError where metres or up are
+    missing, where the marker that session.toml describes is not seen, and where a print lies face down.
+    """
+    marker = None
+    if session.marker is not None:
+        wanted = MarkerDetector(session.marker)
+        seen = metric.agreeing(_sightings(static, sweep, lenses, found, wanted.detect))
+        marker = metric.align_print(seen, metric.Print.of_marker(wanted))
+    board = None
+    if detector is not None:
+        seen = _sightings(static, sweep, lenses, found, detector.detect_true)
+        flat = metric.Print.of_board(detector)
+        # With a marker, or a container, the board may stand or hang anywhere, or be out of sight.
+        if metric.seen_twice(seen) >= flat.needed:
+            board = metric.align_print(seen, flat, upright=marker is None)
+    distance = None
+    if session.distance is not None:
+        first, second = session.distance.cameras
+        distance = scale.distance_scale(found, (first, second), session.distance.metres)
+    return scale.choose_frame(board, marker, distance, container)
+
+
+def _sightings(
+    static: Mapping[str, Image],
+    sweep: Sequence[Image],
+    lenses: Mapping[str, Lens],
+    found: poses.Poses,
+    detect: Callable[[Image], BoardView | None],
+) -> list[metric.Sighting]:
     candidates = [(image, lenses[camera], found.w2c[camera]) for camera, image in static.items()]
     candidates += [(sweep[index], found.sweep_lens, w2c) for index, w2c in zip(found.sweep_indices, found.sweep_w2c)]
-    views = [(detector.detect_true(image), lens, w2c) for image, lens, w2c in candidates]
-    sightings = [metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None]
-    return metric.align(sightings, detector)
+    views = [(detect(image), lens, w2c) for image, lens, w2c in candidates]
+    return [metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None]
