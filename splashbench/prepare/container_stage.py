@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.container import Placement, place_by_silhouettes
+from splashbench.prepare.container import Placement, place_by_silhouettes, up_from_container
 from splashbench.prepare.container_check import Projection, overlay, verify
 from splashbench.prepare.container_points import Click, place_by_points
 from splashbench.prepare.masks import Mask, read_raw_mask
+from splashbench.prepare.metric import GRAVITY
+from splashbench.prepare.scale import Upright
 from splashbench.prepare.session import Session
 from splashbench.prepare.undistort import Undistorter
 from splashbench.scene.camera import Camera
@@ -52,6 +54,19 @@ def place_container(
 
     Raises SplashbenchError where masks or points do not determine a place.
     """
+    assert session.container is not None
+    placement = _place(session, cameras, masks, undistorters, GRAVITY, session.container.scale)
+    return PlacedContainer(placement, verify(container_mesh(session), placement.pose, cameras, masks))
+
+
+def _place(
+    session: Session,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
+    gravity: tuple[float, float, float] | None,
+    metres_per_unit: float | None,
+) -> Placement:
     described, path = session.container, session.container_mesh
     assert described is not None
     assert path is not None
@@ -66,7 +81,7 @@ def place_container(
             training,
             [Click(click.point, _pinhole_pixels(click.pixels, undistorters)) for click in described.points],
             up=described.up or "y",
-            metres_per_unit=described.scale,
+            metres_per_unit=metres_per_unit,
             masks=seen,
             source=f"{session.directory / 'session.toml'}: [container] points",
         )
@@ -76,7 +91,8 @@ def place_container(
             training,
             seen,
             up=described.up,
-            metres_per_unit=described.scale,
+            metres_per_unit=metres_per_unit,
+            gravity=gravity,
             initial=None if placement is None else placement.pose,
             source=source,
         )
@@ -84,7 +100,20 @@ def place_container(
         raise SplashbenchError(
             f"{source}: no mask of a training camera, named <camera>.png; give some, or points under [container]"
         )
-    return PlacedContainer(placement, verify(mesh, placement.pose, cameras, masks))
+    return placement
+
+
+def upright_container(
+    session: Session, cameras: Sequence[Camera], masks: Mapping[str, Mask], undistorters: Mapping[str, Undistorter]
+) -> Upright:
+    """Which way is up, and the metres, from the container in a reconstruction without either: for a session that has
+    neither a flat board nor a marker. `cameras` in structure from motion's own frame."""
+    described = session.container
+    assert described is not None
+    placement = _place(session, cameras, masks, undistorters, gravity=None, metres_per_unit=None)
+    # Structure from motion's units per unit of the mesh were found; the mesh's own metres are known, or not.
+    known = None if described.scale is None else described.scale / placement.scale
+    return Upright(np.asarray(up_from_container(placement)), placement.pose[:3, 3], None, known)
 
 
 def _pinhole_pixels(

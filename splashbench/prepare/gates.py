@@ -16,9 +16,9 @@ from splashbench.errors import SplashbenchError
 from splashbench.prepare.container_stage import PlacedContainer
 from splashbench.prepare.intrinsics import Calibration
 from splashbench.prepare.masks import MaskHealth
-from splashbench.prepare.metric import MetricFrame
 from splashbench.prepare.poses import Poses
 from splashbench.prepare.sampling import Sampling
+from splashbench.prepare.scale import SceneFrame
 from splashbench.prepare.sync import ClockFit, SequenceSync
 
 # Half a frame at 60 fps: the paper's mark for a well synchronised sequence (Sec. S1.1).
@@ -120,20 +120,38 @@ def pose_gates(poses: Poses, cameras: Iterable[str], width: int) -> list[Gate]:
         ),
         Gate("track_length", poses.mean_track_length, 3.0, "at least", "images per point, mean"),
     ]
+    if poses.centre_sigma:
+        worst = max(poses.centre_sigma, key=poses.centre_sigma.__getitem__)
+        detail = f"m, by the noise of the features alone, camera {worst}"
+        gates.append(Gate("centre_sigma", poses.centre_sigma[worst], 1e-3, "at most", detail))
+        turned = max(poses.rotation_sigma_deg, key=poses.rotation_sigma_deg.__getitem__)
+        detail = f"degrees, likewise, camera {turned}"
+        gates.append(Gate("rotation_sigma", poses.rotation_sigma_deg[turned], 0.05, "at most", detail))
     if poses.n_sweep:
         share = len(poses.sweep_w2c) / poses.n_sweep
         gates.append(Gate("sweep_registered", share, 0.5, "at least", f"share of {poses.n_sweep} frames"))
     return gates
 
 
-def metric_gates(frame: MetricFrame) -> list[Gate]:
-    """How well the triangulated board has the shape of the printed one."""
-    relative = frame.rms_m / frame.board_diagonal_m
-    detail = f"RMS over the board's diagonal, {frame.n_corners} corners in {frame.n_views} images"
-    return [
-        Gate("board_residual", relative, 0.005, "at most", detail),
-        Gate("board_is_a_board", relative, 0.05, "at most", "as above; beyond this the scale is meaningless", True),
-    ]
+def metric_gates(frame: SceneFrame) -> list[Gate]:
+    """How well each triangulated print has the shape of the printed one, and how well sources of scale agree."""
+    gates = []
+    for name, seen in frame.prints.items():
+        relative = seen.rms_m / seen.board_diagonal_m
+        detail = f"RMS over the {name}'s diagonal, {seen.n_corners} corners in {seen.n_views} images"
+        gates += [
+            Gate(f"{name}_residual", relative, 0.005, "at most", detail),
+            Gate(
+                f"{name}_is_a_{name}", relative, 0.05, "at most", "as above; beyond this the scale is meaningless", True
+            ),
+        ]
+    sigma = frame.scale_sigma.get(frame.scale_source)
+    if sigma is not None:
+        gates.append(Gate("scale_sigma", sigma, 1e-3, "at most", f"share of the scale, by the {frame.scale_source}"))
+    if frame.scale_disagreement is not None:
+        detail = f"share, largest difference between {', '.join(frame.scales)}"
+        gates.append(Gate("scale_agreement", frame.scale_disagreement, 0.01, "at most", detail))
+    return gates
 
 
 def sampling_gates(sampling: Sampling) -> list[Gate]:

@@ -23,6 +23,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, sha256_file, write_json, write_text
 from splashbench.prepare import container_stage, listening, masking, metric, motion, rig, sampling, sync
 from splashbench.prepare import gates as g
+from splashbench.prepare.board import Detector
 from splashbench.prepare.container_stage import PlacedContainer
 from splashbench.prepare.crop import Box
 from splashbench.prepare.intrinsics import Calibration
@@ -31,6 +32,7 @@ from splashbench.prepare.listening import Listening, SoundPaths
 from splashbench.prepare.masks import Mask
 from splashbench.prepare.preparation import Preparation
 from splashbench.prepare.report import html_report, outlined
+from splashbench.prepare.scale import SceneFrame
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.stages import Stage, StageStore, facts_of, open_stages
 from splashbench.prepare.sync import ClockFit, SequenceSync
@@ -126,7 +128,9 @@ class _Run:
         lenses = {camera: calibration.lens for camera, calibration in calibrations.items()}
         recordings.check_sizes(lenses, self.pour)
         posed = self._posed(recordings, lenses)
-        frame = self._metric(posed, lenses, recordings)
+        undistorters = {camera: Undistorter(lens) for camera, lens in lenses.items()}
+        container_masks = container_stage.container_masks(session.container_folder, undistorters)
+        frame = self._metric(posed, undistorters, container_masks, recordings.detector)
         placed = metric.transformed(posed.poses, frame.scene_from_sfm)
         paths = self._sound_paths(placed.w2c)
         clocks = sync.shifted(heard.clocks, paths.shift_s) if paths.applied else heard.clocks
@@ -140,12 +144,7 @@ class _Run:
         ]
         g.require(gates, str(session.directory))
 
-        undistorters = {camera: Undistorter(lens) for camera, lens in lenses.items()}
-        whole = {
-            camera: Camera(camera, lens.width, lens.height, lens.K, placed.w2c[camera])
-            for camera, lens in lenses.items()
-        }
-        container_masks = container_stage.container_masks(session.container_folder, undistorters)
+        whole = _pinholes(lenses, placed.w2c)
         container = self._container(whole, container_masks, undistorters)
         if container is not None:
             gates += g.container_gates(container, session.train, lenses[cameras[0]].width)
@@ -263,6 +262,7 @@ class _Run:
             "sweep": facts_of(recordings.sweep.paths) if recordings.sweep else None,
             "lenses": lenses,
             "board": self.session.board,
+            "marker": self.session.marker,
         }
 
         def make() -> rig.PosedRig:
@@ -277,12 +277,32 @@ class _Run:
         return self.store.result("poses", rig.PosedRig, inputs, make)
 
     def _metric(
-        self, posed: rig.PosedRig, lenses: Mapping[str, Lens], recordings: rig.RigRecordings
-    ) -> metric.MetricFrame:
-        inputs = {"posed": posed, "board": self.session.board}
-        return self.store.result(
-            "metric", metric.MetricFrame, inputs, lambda: metric.align(posed.sightings, recordings.detector)
-        )
+        self,
+        posed: rig.PosedRig,
+        undistorters: Mapping[str, Undistorter],
+        container_masks: Mapping[str, Mask],
+        detector: Detector,
+    ) -> SceneFrame:
+        session = self.session
+        inputs = {
+            "posed": posed,
+            "board": session.board,
+            "marker": session.marker,
+            "distance": session.distance,
+            "container": session.container,
+            "container_files": facts_of(container_stage.container_files(session)),
+            "train": session.train,
+        }
+
+        def make() -> SceneFrame:
+            container = None
+            if session.container is not None and not rig.prints_are_seen(posed, session, detector):
+                lenses = {camera: undistorter.lens for camera, undistorter in undistorters.items()}
+                cameras = list(_pinholes(lenses, posed.poses.w2c).values())
+                container = container_stage.upright_container(session, cameras, container_masks, undistorters)
+            return rig.find_frame(posed, session, detector, container)
+
+        return self.store.result("metric", SceneFrame, inputs, make)
 
     def _sound_paths(self, w2c: Mapping[str, NDArray[np.float64]]) -> SoundPaths:
         """What the sound's travel does to the clocks, now that the cameras' places are known."""
@@ -408,3 +428,8 @@ class _Run:
                 if t in shown:
                     kept.append(outlined(image, mask))
                 yield camera, t, image, mask
+
+
+def _pinholes(lenses: Mapping[str, Lens], w2c: Mapping[str, NDArray[np.float64]]) -> dict[str, Camera]:
+    """The cameras of undistorted, uncropped frames."""
+    return {name: Camera(name, lens.width, lens.height, lens.K, w2c[name]) for name, lens in lenses.items()}

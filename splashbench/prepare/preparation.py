@@ -14,10 +14,10 @@ from splashbench.prepare.gates import Gate
 from splashbench.prepare.intrinsics import Calibration
 from splashbench.prepare.listening import Listening, SoundPaths
 from splashbench.prepare.masks import MaskHealth
-from splashbench.prepare.metric import MetricFrame
 from splashbench.prepare.motion import MotionInterval
 from splashbench.prepare.poses import Poses
 from splashbench.prepare.sampling import Sampling
+from splashbench.prepare.scale import SceneFrame
 from splashbench.prepare.session import Session
 from splashbench.prepare.stages import Stage, StageRecord
 from splashbench.prepare.sync import ClockFit, SequenceSync
@@ -50,7 +50,7 @@ class Preparation:
     sound_paths: SoundPaths
     sequence: SequenceSync
     poses: Poses
-    metric: MetricFrame
+    metric: SceneFrame
     motion: MotionInterval
     sampling: Sampling
     masks: MaskRecord
@@ -83,7 +83,14 @@ class Preparation:
                 "shift_s": self.sound_paths.shift_s,
             },
             "intrinsics": {camera: _intrinsics(c) for camera, c in self.calibrations.items()},
-            "poses": {camera: {"w2c": matrix.tolist()} for camera, matrix in self.poses.w2c.items()},
+            "poses": {
+                camera: {
+                    "w2c": matrix.tolist(),
+                    "centre_sigma_m": self.poses.centre_sigma.get(camera),
+                    "rotation_sigma_deg": self.poses.rotation_sigma_deg.get(camera),
+                }
+                for camera, matrix in self.poses.w2c.items()
+            },
             "structure_from_motion": {
                 "mean_reprojection_px": self.poses.mean_error_px,
                 "rms_reprojection_px": self.poses.rms_error_px,
@@ -93,13 +100,19 @@ class Preparation:
                 "observations": self.poses.n_observations,
                 "sweep_frames": self.poses.n_sweep,
                 "sweep_frames_registered": len(self.poses.sweep_w2c),
+                "attempts": list(self.poses.attempts),
                 "sweep_K": self.poses.sweep_lens.K.tolist(),
             },
             "metric": {
-                "board_rms_m": self.metric.rms_m,
-                "corners": self.metric.n_corners,
-                "images": self.metric.n_views,
-                "frame": "metres, origin at the board's centre, +y up, +x along the print",
+                "up_from": self.metric.up_source,
+                "metres_from": self.metric.scale_source,
+                "metres_per_unit": self.metric.scales,
+                "scale_sigma": self.metric.scale_sigma,
+                "prints": {
+                    name: {"rms_m": seen.rms_m, "corners": seen.n_corners, "images": seen.n_views}
+                    for name, seen in self.metric.prints.items()
+                },
+                "frame": "metres, +y up; origin at the middle of the print, +x along it",
             },
             "motion": {
                 "start_s": self.motion.start,

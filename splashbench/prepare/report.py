@@ -161,11 +161,12 @@ def _layout(preparation: Preparation) -> list[str]:
     sweep = np.array([_centre(w2c) for w2c in preparation.poses.sweep_w2c]).reshape(-1, 3)
     reach = 1.25 * max(float(np.abs(centre).max()) for centre in centres.values())
     points = preparation.poses.points[np.abs(preparation.poses.points).max(axis=1) < reach]
-    board = preparation.metric.corners
+    prints = preparation.metric.prints
     for index, (title, a, b, label_b) in enumerate((("from above", 0, 2, "z"), ("from the front", 0, 1, "y"))):
         axes = figure.add_subplot(1, 2, index + 1)
         axes.scatter(points[:, a], points[:, b], s=0.3, color="#cccccc")
-        axes.scatter(board[:, a], board[:, b], s=3, color="black", label="board")
+        for name, seen in prints.items():
+            axes.scatter(seen.corners[:, a], seen.corners[:, b], s=3, color="black", label=name)
         axes.plot(sweep[:, a], sweep[:, b], ".", color=SWEEP_COLOUR, markersize=4, label="sweep")
         for camera, centre in centres.items():
             colour = TEST_COLOUR if camera in preparation.session.test else TRAIN_COLOUR
@@ -182,11 +183,33 @@ def _layout(preparation: Preparation) -> list[str]:
     text = (
         f"Mean reprojection error {poses.mean_error_px:.3f} px (RMS {poses.rms_error_px:.3f}) over"
         f" {poses.n_observations} observations of {len(poses.points)} points, in frames {width} px wide;"
-        f" {len(poses.sweep_w2c)} of {poses.n_sweep} sweep frames registered. Board:"
-        f" {preparation.metric.rms_m * 1000:.2f} mm RMS over {preparation.metric.n_corners} corners."
+        f" {len(poses.sweep_w2c)} of {poses.n_sweep} sweep frames registered."
+        + "".join(
+            f" {name.capitalize()}: {seen.rms_m * 1000:.2f} mm RMS over {seen.n_corners} corners."
+            for name, seen in prints.items()
+        )
+        + f" Metres by the {preparation.metric.scale_source}, up by the {preparation.metric.up_source}."
         " Blue: training views; orange: held-out views."
     )
-    return [_figure(figure), f'<p class="note">{html.escape(text)}</p>']
+    rows = [
+        [
+            camera,
+            *(f"{value:.4f}" for value in centres[camera]),
+            f"{poses.centre_sigma[camera] * 1e3:.3f}" if camera in poses.centre_sigma else "unknown",
+            f"{poses.rotation_sigma_deg[camera]:.4f}" if camera in poses.rotation_sigma_deg else "unknown",
+        ]
+        for camera in centres
+    ]
+    header = ["camera", "x [m]", "y [m]", "z [m]", "± centre [mm]", "± rotation [deg]"]
+    note = "±: standard deviations among the fixed cameras by the noise of the features alone."
+    attempts = [f"Structure from motion tried more than once: {line}" for line in poses.attempts[:-1]]
+    return [
+        _figure(figure),
+        f'<p class="note">{html.escape(text)}</p>',
+        _table(header, rows),
+        f'<p class="note">{note}</p>',
+        *(_list(attempts) if attempts else []),
+    ]
 
 
 def _container(placed: PlacedContainer, preparation: Preparation) -> list[str]:

@@ -79,6 +79,24 @@ class Sweep(_Strict):
     files: Chapters
 
 
+class Marker(_Strict):
+    """An ArUco marker that lies flat and face up in the static scene: its number, and the length of its black side.
+
+    It gives gravity and the origin, and metres too, for a session whose board does not lie flat there.
+    """
+
+    dictionary: str = Field(pattern=r"^DICT_[A-Z0-9_]+$")
+    id: int = Field(ge=0, le=100_000)
+    metres: float = Field(gt=0, lt=10)
+
+
+class Distance(_Strict):
+    """The measured distance between two cameras, in metres from the centre of one lens to that of the other."""
+
+    cameras: list[str] = Field(min_length=2, max_length=2)
+    metres: float = Field(gt=0, lt=1000)
+
+
 class Sound(_Strict):
     """Where the sound came from by which clocks are found: `source` [3], metres in the scene's frame (its origin is the
     board's centre, +y up, +x along the print). Given, the sound's travel (2.9 ms per metre) is taken out of the clocks.
@@ -201,6 +219,8 @@ class Session(_Strict):
     timesteps: int = Field(default=50, ge=2, le=10_000)
     motion_interval: tuple[float, float] | None = None
     board: Board | None = None
+    marker: Marker | None = None
+    distance: Distance | None = None
     recordings: Recordings
     sweep: Sweep | None = None
     sound: Sound | None = None
@@ -244,6 +264,18 @@ class Session(_Strict):
             unknown = [camera for camera in listed if camera not in self.cameras]
             if unknown:
                 raise ValueError(f"[recordings.{kind}] names camera {unknown[0]}, which `cameras` does not list")
+        if self.marker is not None and self.board is not None and self.marker.dictionary == self.board.dictionary:
+            on_board = self.board.squares_x * self.board.squares_y // 2
+            if self.marker.id < on_board:
+                raise ValueError(
+                    f"marker {self.marker.id} is also on the board, whose are 0 to {on_board - 1}; print another"
+                )
+        if self.distance is not None:
+            unknown = [camera for camera in self.distance.cameras if camera not in self.cameras]
+            if unknown:
+                raise ValueError(f"[distance] names camera {unknown[0]}, which `cameras` does not list")
+            if len(set(self.distance.cameras)) < 2:
+                raise ValueError("[distance] must name two different cameras")
         if self.recordings.intrinsics and self.board is None:
             raise ValueError("[recordings.intrinsics] needs the [board] that was filmed; describe it")
         return self

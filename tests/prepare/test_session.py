@@ -72,6 +72,17 @@ def test_sweep_board_and_clips_of_it_are_optional(tmp_path: Path) -> None:
         session.paths("intrinsics", "1")
 
 
+def test_a_marker_and_a_measured_distance(tmp_path: Path) -> None:
+    data = description()
+    data["marker"] = {"dictionary": "DICT_4X4_50", "id": 30, "metres": 0.12}
+    data["distance"] = {"cameras": ["1", "3"], "metres": 1.32}
+    session = Session.open(write(tmp_path, data))
+    assert session.marker is not None
+    assert session.marker.id == 30
+    assert session.distance is not None
+    assert session.distance.cameras == ["1", "3"]
+
+
 def test_a_folder_of_masks(tmp_path: Path) -> None:
     data = description() | {"masks": {"provider": "folder", "folder": "truth/masks"}}
     write(tmp_path, data)
@@ -124,6 +135,11 @@ def edit(*keys: str, value: Any = None) -> Callable[[dict[str, Any]], None]:
             "at least 4 squares each way; count squares, not inner corners",
         ),
         (edit("board", "colour", value="red"), r"board\.colour"),
+        (edit("marker", value={"dictionary": "DICT_4X4_50", "id": 19, "metres": 0.1}), "19 is also on the board"),
+        (edit("marker", value={"dictionary": "DICT_4X4_50", "id": 30, "metres": 0.0}), r"marker\.metres"),
+        (edit("distance", value={"cameras": ["1", "9"], "metres": 1.3}), r"\[distance\] names camera 9"),
+        (edit("distance", value={"cameras": ["1", "1"], "metres": 1.3}), "two different cameras"),
+        (edit("distance", value={"cameras": ["1"], "metres": 1.3}), r"distance\.cameras"),
         (edit("schema_version", value=2), "schema_version"),
         (edit("timesteps", value=1), "timesteps"),
         (edit("motion_interval", value=[3.0, 2.0]), "start before end"),

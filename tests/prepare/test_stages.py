@@ -16,15 +16,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.board import BoardView
+from splashbench.prepare.container_stage import PlacedContainer
 from splashbench.prepare.intrinsics import Calibration
 from splashbench.prepare.lens import Lens
 from splashbench.prepare.listening import Listening
+from splashbench.prepare.masking import CameraMasks
 from splashbench.prepare.metric import MetricFrame, Sighting, Similarity
 from splashbench.prepare.motion import MotionInterval
+from splashbench.prepare.rig import PosedRig
 from splashbench.prepare.sampling import Sampling
+from splashbench.prepare.scale import SceneFrame
 from splashbench.prepare.stages import STAGES, StageStore, facts_of, open_stages
 from splashbench.prepare.sync import ClockFit, SequenceSync
 
@@ -79,6 +84,25 @@ RESULTS = [
         (Sighting(BoardView(np.arange(6), RNG.random((6, 2)), RNG.random((6, 2))), LENS, np.eye(4)),),
     ),
 ]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        Listening,
+        MotionInterval,
+        SequenceSync,
+        Sampling,
+        Calibration,
+        PosedRig,
+        SceneFrame,
+        PlacedContainer,
+        CameraMasks,
+    ],
+)
+def test_every_stage_s_result_can_be_read_back(kind: type) -> None:
+    """Annotations that cannot be stored would show only after minutes of work."""
+    TypeAdapter(kind)
 
 
 @pytest.mark.parametrize(("kind", "made"), RESULTS, ids=[str(kind) for kind, _ in RESULTS])
