@@ -41,11 +41,11 @@ class Gate:
         """Whether the value is on the right side of the limit."""
         if self.value is None or not np.isfinite(self.value):
             return False
-        return self.value <= self.limit if self.side == "at most" else self.value >= self.limit
+        return bool(self.value <= self.limit if self.side == "at most" else self.value >= self.limit)
 
     def as_json(self) -> dict[str, Any]:
         """The gate as it stands in prepare_report.json."""
-        value = self.value if self.value is not None and np.isfinite(self.value) else None
+        value = float(self.value) if self.value is not None and np.isfinite(self.value) else None
         return {
             "name": self.name,
             "value": value,

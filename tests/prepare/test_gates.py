@@ -25,6 +25,7 @@ from splashbench.prepare.sync import ClockFit, SequenceSync
         (float("nan"), "at most", False),
         (float("inf"), "at least", False),
         (None, "at most", False),
+        (np.float64(0.25), "at most", True),
     ],
 )
 def test_a_gate_passes_on_the_right_side_of_its_limit(value, side, passed) -> None:
