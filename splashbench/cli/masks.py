@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from splashbench.cli.output import add_json, emit, say, table
 
 if TYPE_CHECKING:
-    from splashbench.prepare.mask_comparison import MaskChange
+    from splashbench.prepare.masks.comparison import MaskChange
 
 _EPILOG = """\
 examples:
@@ -78,7 +78,7 @@ def _columns(text: str) -> int:
 def compare(arguments: argparse.Namespace) -> int:
     """Handle `splashbench masks compare`."""
     from splashbench.files import files_together, require_folder_place
-    from splashbench.prepare.mask_comparison import change_rows, compare_folders
+    from splashbench.prepare.masks.comparison import change_rows, compare_folders
 
     if arguments.out is not None:
         require_folder_place(arguments.out)
@@ -88,7 +88,7 @@ def compare(arguments: argparse.Namespace) -> int:
     print_table = print if not arguments.json else say
     print_table(table(header, [_row(*key, change) for key, change in rows.items()]))
     if arguments.out is not None:
-        from splashbench.prepare.mask_comparison_report import write_report
+        from splashbench.prepare.masks.comparison_report import write_report
 
         with files_together(arguments.out) as staging:
             names = write_report(comparisons, rows, staging)
@@ -131,8 +131,8 @@ def sheet(arguments: argparse.Namespace) -> int:
     """Handle `splashbench masks sheet`."""
     from splashbench.errors import SplashbenchError
     from splashbench.files import require_file_place, write_png
-    from splashbench.prepare.mask_comparison import find_mask_sets
-    from splashbench.prepare.mask_sheet import sheet_of_set
+    from splashbench.prepare.masks.comparison import find_mask_sets
+    from splashbench.prepare.masks.sheet import sheet_of_set
 
     if arguments.out.suffix.lower() != ".png":
         raise SplashbenchError(f"{arguments.out} does not end in .png; name the picture so")

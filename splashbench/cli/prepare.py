@@ -108,7 +108,7 @@ def _metres(text: str) -> float:
 
 def _describe(arguments: argparse.Namespace) -> int:
     """Handle `splashbench prepare SESSION --init`."""
-    from splashbench.prepare.description import describe
+    from splashbench.prepare.describe.description import describe
 
     found = describe(arguments.session, arguments.square_metres, arguments.replace)
     rows = [

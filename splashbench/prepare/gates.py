@@ -13,13 +13,13 @@ from typing import Any, Literal
 import numpy as np
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.container_stage import PlacedContainer
-from splashbench.prepare.intrinsics import Calibration
-from splashbench.prepare.masks import MaskHealth
-from splashbench.prepare.poses import Poses
-from splashbench.prepare.sampling import Sampling
-from splashbench.prepare.scale import SceneFrame
-from splashbench.prepare.sync import ClockFit, SequenceSync
+from splashbench.prepare.calibration.intrinsics import Calibration
+from splashbench.prepare.container.stage import PlacedContainer
+from splashbench.prepare.film.sampling import Sampling
+from splashbench.prepare.masks.provider import MaskHealth
+from splashbench.prepare.posing.poses import Poses
+from splashbench.prepare.posing.scale import SceneFrame
+from splashbench.prepare.sound.sync import ClockFit, SequenceSync
 
 # Half a frame at 60 fps: the paper's mark for a well synchronised sequence (Sec. S1.1).
 HALF_FRAME_S = 0.5 / 60

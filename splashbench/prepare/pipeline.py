@@ -21,23 +21,27 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, sha256_file, write_json, write_text
-from splashbench.prepare import container_stage, listening, masking, metric, motion, rig, sampling, sync
 from splashbench.prepare import gates as g
-from splashbench.prepare.board import Detector
-from splashbench.prepare.container_stage import PlacedContainer
+from splashbench.prepare.calibration.board import Detector
+from splashbench.prepare.calibration.intrinsics import Calibration
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.calibration.undistort import Undistorter
+from splashbench.prepare.container import stage as container_stage
+from splashbench.prepare.container.stage import PlacedContainer
 from splashbench.prepare.crop import Box
-from splashbench.prepare.intrinsics import Calibration
-from splashbench.prepare.lens import Lens
-from splashbench.prepare.listening import Listening, SoundPaths
-from splashbench.prepare.masks import Mask
+from splashbench.prepare.film import motion, sampling
+from splashbench.prepare.film.video import Recording
+from splashbench.prepare.masks import making as masking
+from splashbench.prepare.masks.provider import Mask
+from splashbench.prepare.posing import metric, rig
+from splashbench.prepare.posing.scale import SceneFrame
 from splashbench.prepare.preparation import Preparation
 from splashbench.prepare.report import html_report, outlined
-from splashbench.prepare.scale import SceneFrame
 from splashbench.prepare.session import DESCRIPTION, Session
+from splashbench.prepare.sound import listening, sync
+from splashbench.prepare.sound.listening import Listening, SoundPaths
+from splashbench.prepare.sound.sync import ClockFit, SequenceSync
 from splashbench.prepare.stages import Stage, StageStore, facts_of, open_stages
-from splashbench.prepare.sync import ClockFit, SequenceSync
-from splashbench.prepare.undistort import Undistorter
-from splashbench.prepare.video import Recording
 from splashbench.progress import track
 from splashbench.scene.camera import Camera
 from splashbench.scene.layout import SceneMeta

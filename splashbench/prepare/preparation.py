@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.prepare.container_stage import PlacedContainer
+from splashbench.prepare.calibration.intrinsics import Calibration
+from splashbench.prepare.container.stage import PlacedContainer
 from splashbench.prepare.crop import Box
+from splashbench.prepare.film.motion import MotionInterval
+from splashbench.prepare.film.sampling import Sampling
+from splashbench.prepare.film.video import VideoInfo
 from splashbench.prepare.gates import Gate
-from splashbench.prepare.intrinsics import Calibration
-from splashbench.prepare.listening import Listening, SoundPaths
-from splashbench.prepare.masks import MaskHealth
-from splashbench.prepare.motion import MotionInterval
-from splashbench.prepare.poses import Poses
-from splashbench.prepare.sampling import Sampling
-from splashbench.prepare.scale import SceneFrame
+from splashbench.prepare.masks.provider import MaskHealth
+from splashbench.prepare.posing.poses import Poses
+from splashbench.prepare.posing.scale import SceneFrame
 from splashbench.prepare.session import Session
+from splashbench.prepare.sound.listening import Listening, SoundPaths
+from splashbench.prepare.sound.sync import ClockFit, SequenceSync
 from splashbench.prepare.stages import Stage, StageRecord
-from splashbench.prepare.sync import ClockFit, SequenceSync
-from splashbench.prepare.video import VideoInfo
 from splashbench.version import __version__
 
 SCHEMA_VERSION = 1

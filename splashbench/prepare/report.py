@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.prepare.intrinsics import COVERAGE_CELLS
+from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
 
 if TYPE_CHECKING:
-    from splashbench.prepare.container_stage import PlacedContainer
+    from splashbench.prepare.container.stage import PlacedContainer
     from splashbench.prepare.preparation import Preparation
 
 OUTLINE_COLOUR = (255, 40, 40)

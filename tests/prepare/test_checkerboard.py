@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.board import BoardDetector, BoardView
-from splashbench.prepare.checkerboard import CheckerboardDetector, board_detector, like_turns, numbered_alike
-from splashbench.prepare.intrinsics import calibrate, calibrate_views
-from splashbench.prepare.lens import Lens
+from splashbench.prepare.calibration.board import BoardDetector, BoardView
+from splashbench.prepare.calibration.checkerboard import (
+    CheckerboardDetector,
+    board_detector,
+    like_turns,
+    numbered_alike,
+)
+from splashbench.prepare.calibration.intrinsics import calibrate, calibrate_views
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.film.stills import Stills
 from splashbench.prepare.session import Board
-from splashbench.prepare.stills import Stills
 
 BOARD = Board(kind="checkerboard", squares_x=8, squares_y=5, square_metres=0.03)
 REAL_BOARD = Board(kind="checkerboard", squares_x=8, squares_y=5, square_metres=0.06)

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from splashbench import toml
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.container import Placement, place_by_silhouettes, up_from_container
-from splashbench.prepare.container_check import overlay, silhouette, verify
-from splashbench.prepare.container_points import Click, place_by_points
-from splashbench.prepare.contour import find_contour
+from splashbench.prepare.container.check import overlay, silhouette, verify
+from splashbench.prepare.container.contour import find_contour
+from splashbench.prepare.container.placement import Placement, place_by_silhouettes, up_from_container
+from splashbench.prepare.container.points import Click, place_by_points
 from splashbench.prepare.session import Session
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh

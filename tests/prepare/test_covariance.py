@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from splashbench.prepare.covariance import PoseSigmas, pose_sigmas
-from splashbench.prepare.mapping import Workplace, refine
+from splashbench.prepare.posing.covariance import PoseSigmas, pose_sigmas
+from splashbench.prepare.posing.mapping import Workplace, refine
 
 NOISE_PX = 0.5
 DRAWS = 40

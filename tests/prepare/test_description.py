@@ -12,10 +12,10 @@ import pytest
 from splashbench import toml
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.board_guess import guess_board
-from splashbench.prepare.description import describe
-from splashbench.prepare.discovery import Film, find_films
-from splashbench.prepare.looking import Look, MarkerFinder, assign, look_at
+from splashbench.prepare.describe.board_guess import guess_board
+from splashbench.prepare.describe.description import describe
+from splashbench.prepare.describe.discovery import Film, find_films
+from splashbench.prepare.describe.looking import Look, MarkerFinder, assign, look_at
 
 BOARD = cv2.aruco.CharucoBoard((8, 5), 0.03, 0.0225, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50))
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.board import BoardDetector, BoardView
-from splashbench.prepare.intrinsics import calibrate, calibrate_views, coverage, spread_out
-from splashbench.prepare.lens import Lens
+from splashbench.prepare.calibration.board import BoardDetector, BoardView
+from splashbench.prepare.calibration.intrinsics import calibrate, calibrate_views, coverage, spread_out
+from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.session import Board
 
 BOARD = Board(squares_x=8, squares_y=5, square_metres=0.03, marker_metres=0.0225, dictionary="DICT_4X4_50")
@@ -223,8 +223,8 @@ def test_coverage_counts_cells() -> None:
 
 
 def test_real_inverted_board_is_detected_and_its_poor_coverage_flagged(test_data: Path) -> None:
+    from splashbench.prepare.film.video import Recording
     from splashbench.prepare.gates import intrinsics_gates
-    from splashbench.prepare.video import Recording
 
     clip = test_data / "real/charuco/calibration/extrinsic/cam_0.mp4"
     board = Board(

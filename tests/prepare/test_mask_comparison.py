@@ -11,7 +11,7 @@ import pytest
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_image, write_png
-from splashbench.prepare.mask_comparison import (
+from splashbench.prepare.masks.comparison import (
     change_rows,
     compare_folders,
     compare_mask_sets,
@@ -19,9 +19,9 @@ from splashbench.prepare.mask_comparison import (
     mask_change,
     worst_pairs,
 )
-from splashbench.prepare.mask_comparison_report import write_report
-from splashbench.prepare.mask_drawing import ADDED, OUTLINE, REMOVED, changed, outlined
-from splashbench.prepare.mask_sheet import (
+from splashbench.prepare.masks.comparison_report import write_report
+from splashbench.prepare.masks.drawing import ADDED, OUTLINE, REMOVED, changed, outlined
+from splashbench.prepare.masks.sheet import (
     EMPTY,
     FLICKERING,
     FLOODED,

@@ -10,12 +10,12 @@ import pytest
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
-from splashbench.prepare.background import Background, BackgroundMasks, segment
-from splashbench.prepare.container_stage import container_masks
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.calibration.undistort import Undistorter
+from splashbench.prepare.container.stage import container_masks
 from splashbench.prepare.crop import Box
-from splashbench.prepare.lens import Lens
-from splashbench.prepare.masks import FolderMasks, mask_health
-from splashbench.prepare.undistort import Undistorter
+from splashbench.prepare.masks.background import Background, BackgroundMasks, segment
+from splashbench.prepare.masks.provider import FolderMasks, mask_health
 
 WIDTH, HEIGHT = 240, 160
 

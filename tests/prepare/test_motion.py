@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.motion import camera_motion, find_motion
-from splashbench.prepare.sync import ClockFit
-from splashbench.prepare.video import Recording
+from splashbench.prepare.film.motion import camera_motion, find_motion
+from splashbench.prepare.film.video import Recording
+from splashbench.prepare.sound.sync import ClockFit
 
 FPS = 30
 

@@ -11,13 +11,21 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare import mapping, rig
-from splashbench.prepare import poses as poses_module
-from splashbench.prepare.board import BoardDetector, BoardView
-from splashbench.prepare.lens import Lens
-from splashbench.prepare.metric import Sighting, Similarity, align, initial_points, transformed, triangulate, umeyama
-from splashbench.prepare.poses import Poses, estimate_poses, sharpest_per_bin, sharpness_of, static_image
-from splashbench.prepare.rig import find_metres, find_poses
+from splashbench.prepare.calibration.board import BoardDetector, BoardView
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.posing import mapping, rig
+from splashbench.prepare.posing import poses as poses_module
+from splashbench.prepare.posing.metric import (
+    Sighting,
+    Similarity,
+    align,
+    initial_points,
+    transformed,
+    triangulate,
+    umeyama,
+)
+from splashbench.prepare.posing.poses import Poses, estimate_poses, sharpest_per_bin, sharpness_of, static_image
+from splashbench.prepare.posing.rig import find_metres, find_poses
 from splashbench.prepare.session import Board
 
 WIDTH, HEIGHT = 400, 225

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.sampling import sample_frames, sample_times
-from splashbench.prepare.sync import ClockFit
+from splashbench.prepare.film.sampling import sample_frames, sample_times
+from splashbench.prepare.sound.sync import ClockFit
 
 
 def clock(start: float = 0.0, rate: float = 1.0) -> ClockFit:

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare import rig
-from splashbench.prepare.board import BoardDetector, BoardView
-from splashbench.prepare.lens import Lens
-from splashbench.prepare.marker import MarkerDetector
-from splashbench.prepare.metric import MetricFrame, Print, Sighting, Similarity, agreeing, align_print
-from splashbench.prepare.poses import Poses
-from splashbench.prepare.scale import SceneFrame, Upright, choose_frame, distance_scale, rescaled, scene_frame
+from splashbench.prepare.calibration.board import BoardDetector, BoardView
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.calibration.marker import MarkerDetector
+from splashbench.prepare.posing import rig
+from splashbench.prepare.posing.metric import MetricFrame, Print, Sighting, Similarity, agreeing, align_print
+from splashbench.prepare.posing.poses import Poses
+from splashbench.prepare.posing.scale import SceneFrame, Upright, choose_frame, distance_scale, rescaled, scene_frame
 from splashbench.prepare.session import Board, Distance, Marker
 
 WIDTH, HEIGHT = 1200, 800

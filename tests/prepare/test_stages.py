@@ -19,19 +19,19 @@ import pytest
 from pydantic import TypeAdapter
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.board import BoardView
-from splashbench.prepare.container_stage import PlacedContainer
-from splashbench.prepare.intrinsics import Calibration
-from splashbench.prepare.lens import Lens
-from splashbench.prepare.listening import Listening
-from splashbench.prepare.masking import CameraMasks
-from splashbench.prepare.metric import MetricFrame, Sighting, Similarity
-from splashbench.prepare.motion import MotionInterval
-from splashbench.prepare.rig import PosedRig
-from splashbench.prepare.sampling import Sampling
-from splashbench.prepare.scale import SceneFrame
+from splashbench.prepare.calibration.board import BoardView
+from splashbench.prepare.calibration.intrinsics import Calibration
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.container.stage import PlacedContainer
+from splashbench.prepare.film.motion import MotionInterval
+from splashbench.prepare.film.sampling import Sampling
+from splashbench.prepare.masks.making import CameraMasks
+from splashbench.prepare.posing.metric import MetricFrame, Sighting, Similarity
+from splashbench.prepare.posing.rig import PosedRig
+from splashbench.prepare.posing.scale import SceneFrame
+from splashbench.prepare.sound.listening import Listening
+from splashbench.prepare.sound.sync import ClockFit, SequenceSync
 from splashbench.prepare.stages import STAGES, StageStore, facts_of, open_stages
-from splashbench.prepare.sync import ClockFit, SequenceSync
 
 
 @pytest.fixture

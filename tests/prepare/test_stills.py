@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.stills import Stills, open_recording
-from splashbench.prepare.video import Recording
+from splashbench.prepare.film.stills import Stills, open_recording
+from splashbench.prepare.film.video import Recording
 
 
 def photograph(path: Path, value: int = 0, size: tuple[int, int] = (40, 24), orientation: int | None = None) -> None:
@@ -111,6 +111,6 @@ def test_faults_are_one_line_naming_the_file(folder: Path, spoil: Callable[[Path
 
 
 def test_a_folder_has_a_bounded_number_of_photographs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splashbench.prepare.stills.MAX_PHOTOGRAPHS", 2)
+    monkeypatch.setattr("splashbench.prepare.film.stills.MAX_PHOTOGRAPHS", 2)
     with pytest.raises(SplashbenchError, match="more than 2 photographs"):
         _ = Stills([folder]).info

@@ -11,8 +11,9 @@ import pytest
 from scipy import signal
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.audio import join_audio
-from splashbench.prepare.sync import (
+from splashbench.prepare.film.video import open_media
+from splashbench.prepare.sound.audio import join_audio
+from splashbench.prepare.sound.sync import (
     ClockFit,
     correct_for_sound_paths,
     estimate_sync,
@@ -20,7 +21,6 @@ from splashbench.prepare.sync import (
     sequence_sync_rms,
     track_status,
 )
-from splashbench.prepare.video import open_media
 
 RATE = 48000
 LEAD = 3.0  # seconds of source signal before time 0

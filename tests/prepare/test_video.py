@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.video import Recording, _scan, probe
+from splashbench.prepare.film.video import Recording, _scan, probe
 
 RATE = 48000
 B_FRAMES = {"bf": "3", "g": "12", "crf": "20"}

@@ -1,0 +1,1 @@
+"""The cameras' lenses, from prints of known size."""

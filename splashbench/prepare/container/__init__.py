@@ -1,0 +1,1 @@
+"""The container's mesh, placed in the scene by its silhouettes or by clicked points."""

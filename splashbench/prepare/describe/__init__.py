@@ -1,0 +1,1 @@
+"""The first session.toml, by looking at the recordings."""

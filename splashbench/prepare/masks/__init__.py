@@ -1,0 +1,1 @@
+"""Liquid masks: where they come from, and how two sets of them compare."""

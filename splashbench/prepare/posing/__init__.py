@@ -1,0 +1,1 @@
+"""Where the cameras stand, in metres and upright."""

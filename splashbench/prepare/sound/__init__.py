@@ -1,0 +1,1 @@
+"""The cameras' clocks from their sound."""
