@@ -33,10 +33,11 @@ from splashbench.prepare.film import motion, sampling
 from splashbench.prepare.film.video import Recording
 from splashbench.prepare.masks import making as masking
 from splashbench.prepare.masks.provider import Mask
+from splashbench.prepare.masks.sheet import SheetCell, sheet_times, small_cell
 from splashbench.prepare.posing import metric, rig
 from splashbench.prepare.posing.scale import SceneFrame
-from splashbench.prepare.preparation import Preparation
-from splashbench.prepare.report import html_report, outlined
+from splashbench.prepare.preparation import MaskRecord, Preparation
+from splashbench.prepare.report import html_report
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.sound import listening, sync
 from splashbench.prepare.sound.listening import Listening, SoundPaths
@@ -47,7 +48,7 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.layout import SceneMeta
 from splashbench.scene.writing import write_scene
 
-THUMBNAILS = 3  # frames per camera on the report's page
+SHEET_COLUMNS = 6  # timesteps on the report's contact sheet
 WORK_FOLDER = "prepare"  # within the session
 _UNFINISHED = "unfinished_scene.txt"
 
@@ -116,7 +117,7 @@ class _Run:
     session: Session
     options: Options
     store: StageStore
-    thumbnails: dict[str, list[Image]] = field(default_factory=dict)
+    sheet: dict[str, list[SheetCell]] = field(default_factory=dict)
     overlays: dict[str, Image] = field(default_factory=dict)
 
     def into(self, directory: Path) -> Preparation:
@@ -169,7 +170,7 @@ class _Run:
                 test=session.test,
                 n_frames=len(sampled.times),
                 frames=self._frames(
-                    sampled, undistorters, store, windows, self._overlays(container, whole, container_masks)
+                    sampled, undistorters, store, windows, record, self._overlays(container, whole, container_masks)
                 ),
                 meta=self._meta(sampled, windows, record.provider, container),
                 initial_points=metric.initial_points(placed),
@@ -195,7 +196,7 @@ class _Run:
             cropped=self.options.crop,
             gates=gates,
             stages=dict(self.store.records),
-            thumbnails=self.thumbnails,
+            sheet=self.sheet,
             overlays=self.overlays,
         )
 
@@ -417,20 +418,21 @@ class _Run:
         undistorters: Mapping[str, Undistorter],
         store: masking.MaskStore,
         windows: Mapping[str, Box],
+        record: MaskRecord,
         keep_overlay: Callable[[str, Image], None],
     ) -> Iterator[tuple[str, int, Image, Mask]]:
-        """The scene's images and masks, camera by camera; a few are kept as thumbnails in passing."""
-        shown = set(np.linspace(0, len(sampled.times) - 1, THUMBNAILS).round().astype(int).tolist())
+        """The scene's images and masks, camera by camera; a few are kept for the contact sheet in passing."""
+        shown = set(sheet_times(len(sampled.times), record.faults, SHEET_COLUMNS))
         for camera, recording in self.pour.items():
             window = windows[camera]
-            kept = self.thumbnails.setdefault(camera, [])
+            kept = self.sheet.setdefault(camera, [])
             for t, (_, raw) in enumerate(recording.frames(sampled.indices[camera].tolist())):
                 whole = undistorters[camera].image(raw)
                 if t == 0:
                     keep_overlay(camera, whole)
                 image, mask = window.cut(whole), window.cut(store.read(camera, t))
                 if t in shown:
-                    kept.append(outlined(image, mask))
+                    kept.append(small_cell(image, mask, record.faults[camera].get(t, "")))
                 yield camera, t, image, mask
 
 

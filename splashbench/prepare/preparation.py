@@ -16,6 +16,7 @@ from splashbench.prepare.film.sampling import Sampling
 from splashbench.prepare.film.video import VideoInfo
 from splashbench.prepare.gates import Gate
 from splashbench.prepare.masks.provider import MaskHealth
+from splashbench.prepare.masks.sheet import Faults, SheetCell
 from splashbench.prepare.posing.poses import Poses
 from splashbench.prepare.posing.scale import SceneFrame
 from splashbench.prepare.session import Session
@@ -34,6 +35,7 @@ class MaskRecord:
     provider: str
     areas: dict[str, list[int]]
     health: dict[str, MaskHealth]
+    faults: Faults
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Preparation:
     cropped: bool
     gates: list[Gate]
     stages: dict[Stage, StageRecord]
-    thumbnails: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict, repr=False)
+    sheet: dict[str, list[SheetCell]] = field(default_factory=dict, repr=False)
     overlays: dict[str, NDArray[np.uint8]] = field(default_factory=dict, repr=False)
 
     @property
@@ -130,6 +132,7 @@ class Preparation:
                 "provider": self.masks.provider,
                 "areas_px": self.masks.areas,
                 "empty": {camera: health.empty for camera, health in self.masks.health.items()},
+                "faults": {camera: {str(t): why for t, why in f.items()} for camera, f in self.masks.faults.items()},
                 "failed": {camera: health.failed for camera, health in self.masks.health.items()},
             },
             "container": None if self.container is None else _container(self.container),

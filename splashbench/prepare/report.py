@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
+from splashbench.prepare.masks.sheet import fault_note, mask_sheet, sheet_times
 
 if TYPE_CHECKING:
     from splashbench.prepare.container.stage import PlacedContainer
     from splashbench.prepare.preparation import Preparation
 
-OUTLINE_COLOUR = (255, 40, 40)
-THUMBNAIL_WIDTH = 320
 TRAIN_COLOUR, TEST_COLOUR, SWEEP_COLOUR = "#1f5fa8", "#c2571a", "#9a9a9a"
 
 _STYLE = """
@@ -64,18 +63,6 @@ def html_report(preparation: Preparation) -> str:
         + "\n".join(body)
         + "\n</body></html>\n"
     )
-
-
-def outlined(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A frame [H, W, 3] with the outline of its mask [H, W] drawn on it, at most 320 pixels wide."""
-    import cv2
-
-    scale = min(1.0, THUMBNAIL_WIDTH / image.shape[1])
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    shrunk = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    contours, _ = cv2.findContours(shrunk, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(cv2.drawContours(small, contours, -1, OUTLINE_COLOUR, 1))
 
 
 def _section(title: str, content: Iterable[str]) -> list[str]:
@@ -122,12 +109,14 @@ def _masks(preparation: Preparation) -> list[str]:
         axes.plot(times, areas, style, label=camera, linewidth=1.2)
     axes.set(xlabel="time [s]", ylabel="mask area [px]", ylim=(0, None))
     axes.legend(title="camera", fontsize=8, ncols=2)
-    sheet = [
-        f'<figure><img alt="camera {html.escape(camera)}" src="{_image_uri(thumbnail)}">'
-        f"<figcaption>camera {html.escape(camera)}, t = {times[t]:.3f} s</figcaption></figure>"
-        for camera, thumbnails in preparation.thumbnails.items()
-        for t, thumbnail in zip(np.linspace(0, len(times) - 1, len(thumbnails)).round().astype(int), thumbnails)
-    ]
+    shown = sheet_times(len(times), preparation.masks.faults, len(next(iter(preparation.sheet.values()))))
+    sheet = mask_sheet(
+        f"{preparation.session.name}: masks ({preparation.masks.provider})",
+        [f"{t}: {times[t]:.3f} s" for t in shown],
+        preparation.sheet,
+        {camera: fault_note(found, len(times)) for camera, found in preparation.masks.faults.items()},
+    )
+    picture = f'<p><img alt="contact sheet of the masks" src="{_image_uri(sheet)}"></p>'
     rows = [
         [
             camera,
@@ -142,7 +131,7 @@ def _masks(preparation: Preparation) -> list[str]:
         )
     ]
     header = ["camera", "empty frames", "failed frames", "image written", "its corner in the frame"]
-    return [_figure(figure), _table(header, rows), '<div class="sheet">', *sheet, "</div>"]
+    return [_figure(figure), _table(header, rows), picture]
 
 
 def _frames(positions: Sequence[int]) -> str:

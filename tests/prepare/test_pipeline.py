@@ -240,8 +240,8 @@ def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
     spans = [np.linalg.norm(centres[:, None] - centres[None], axis=-1).sum() for centres in (found, known)]
     assert abs(spans[0] / spans[1] - 1) < 0.005
     page = (out / "prepare_report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
-    assert page.count("data:image/jpeg;base64,") == 21
+    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/jpeg;base64,") == 1
     assert "http" not in page
 
 

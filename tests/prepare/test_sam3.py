@@ -16,7 +16,7 @@ import pytest
 from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.masks.provider import sam3_checkpoint
+from splashbench.prepare.masks import sam3_checkpoint
 from splashbench.prepare.masks.sam3 import Sam3Masks
 from splashbench.prepare.masks.sam3_checkpoint import Sam3Checkpoint
 from splashbench.prepare.session import Click, Masks

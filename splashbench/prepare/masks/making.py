@@ -19,6 +19,7 @@ from splashbench.prepare.crop import Box, bounding_box, crop_window
 from splashbench.prepare.film.video import Recording
 from splashbench.prepare.masks.background import BackgroundMasks
 from splashbench.prepare.masks.provider import FolderMasks, Mask, MaskProvider, mask_health
+from splashbench.prepare.masks.sheet import mask_faults
 from splashbench.prepare.preparation import MaskRecord
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.sound.sync import ClockFit
@@ -132,7 +133,8 @@ class MaskStore:
         """The masks' areas and health, for the report."""
         areas = {camera: list(found.areas) for camera, (_, found) in self._made.items()}
         health = {camera: mask_health(areas[camera], undistorters[camera].n_pixels) for camera in areas}
-        return MaskRecord(provider, areas, health)
+        pixels = {camera: undistorters[camera].n_pixels for camera in areas}
+        return MaskRecord(provider, areas, health, mask_faults(areas, pixels))
 
     def read(self, camera: str, t: int) -> Mask:
         """One mask [H, W]."""

@@ -30,6 +30,7 @@ VANISHED = "empty, but not before and after"
 MISSED = "misses what other views see"
 _IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 _LABEL, _HEADER, _TITLE, _CAPTION, _GAP, _BORDER = 118, 22, 34, 18, 6, 3
+CELL_WIDTH = 260  # pixels
 _MAX_CELLS = 2000
 
 
@@ -40,6 +41,17 @@ class SheetCell:
     image: NDArray[np.uint8]
     mask: Mask
     fault: str = ""
+
+
+def small_cell(image: NDArray[np.uint8], mask: Mask, fault: str = "", width: int = 2 * CELL_WIDTH) -> SheetCell:
+    """A cell of an image [H, W, 3] and its mask [H, W], shrunk to at most `width` pixels across."""
+    import cv2
+
+    scale = min(1.0, width / image.shape[1])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    shrunk = np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)) > 0
+    return SheetCell(small, shrunk, fault)
 
 
 def mask_faults(
@@ -82,7 +94,7 @@ def mask_sheet(
     columns: Sequence[str],
     rows: Mapping[str, Sequence[SheetCell]],
     notes: Mapping[str, str] | None = None,
-    cell_width: int = 260,
+    cell_width: int = CELL_WIDTH,
 ) -> NDArray[np.uint8]:
     """Draw the sheet, RGB uint8 [H, W, 3].
 
@@ -133,7 +145,7 @@ def _drawn(cell: SheetCell, width: int, height: int) -> NDArray[np.uint8]:
 
 
 def sheet_of_set(
-    masks: MaskSet, columns: int = 8, images: Path | None = None, cell_width: int = 260
+    masks: MaskSet, columns: int = 8, images: Path | None = None, cell_width: int = CELL_WIDTH
 ) -> tuple[NDArray[np.uint8], Faults, list[str]]:
     """The sheet of a scene's masks, or of a folder of masks.
 
