@@ -246,6 +246,47 @@ def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_only_what_changed_is_done_again(made_up: Path, tmp_path: Path) -> None:
+    session = Path(shutil.copytree(made_up, tmp_path / "session"))
+    options = Options(timesteps=5)
+    first = prepare(session, tmp_path / "first", options)
+    again = prepare(session, tmp_path / "again", options)
+    assert [stage for stage, record in first.stages.items() if record.reused] == []
+    assert [stage for stage, record in again.stages.items() if not record.reused] == ["scene"]
+    assert contents(tmp_path / "again") == contents(tmp_path / "first")
+
+    masks = prepare(session, tmp_path / "masks", Options(timesteps=5, again_from="masks"))
+    assert [stage for stage, record in masks.stages.items() if not record.reused] == ["masks", "scene"]
+    assert contents(tmp_path / "masks") == contents(tmp_path / "first")
+
+    # The container is new, and the source of the sound shifts clocks, hence frames, hence masks; nothing else is touched.
+    container = {"mesh": "truth/container.ply", "masks": "truth/container_masks"}
+    edit(session, container=container, sound={"source": [0.6, 0.1, 0.2]})
+    changed = prepare(session, tmp_path / "changed", options)
+    redone = [stage for stage, record in changed.stages.items() if not record.reused]
+    assert set(redone) == {"motion", "metric", "container", "masks", "scene"}
+    assert changed.sound_paths.applied
+    reach = {camera: changed.sound_paths.distance_m[camera] for camera in changed.clocks}
+    for camera, clock in changed.clocks.items():
+        moved = clock.start_s - first.clocks[camera].start_s
+        assert moved == pytest.approx((reach[camera] - reach["1"]) / 343.0, abs=1e-9)
+    assert changed.container is not None
+    assert min(seen.iou for seen in changed.container.projections.values()) > 0.99
+    names = {gate.name for gate in changed.warnings}
+    assert not {name for name in names if name.startswith("container")}
+    from splashbench.scene import Scene
+
+    mesh = Scene.open(tmp_path / "changed").container_mesh()
+    assert mesh is not None
+    page = (tmp_path / "changed/prepare_report.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 1 + 7
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.slow
 def test_a_folder_of_masks_whole_frames_and_a_given_interval(made_up: Path, tmp_path: Path) -> None:
     from splashbench.scene import Scene
 
