@@ -259,7 +259,7 @@ def test_only_what_changed_is_done_again(made_up: Path, tmp_path: Path) -> None:
     assert [stage for stage, record in masks.stages.items() if not record.reused] == ["masks", "scene"]
     assert contents(tmp_path / "masks") == contents(tmp_path / "first")
 
-    # The container is new, and the source of the sound shifts clocks, hence frames, hence masks; nothing else is touched.
+    # The container is new, and the sound's source shifts clocks, hence frames, hence masks; nothing else is touched.
     container = {"mesh": "truth/container.ply", "masks": "truth/container_masks"}
     edit(session, container=container, sound={"source": [0.6, 0.1, 0.2]})
     changed = prepare(session, tmp_path / "changed", options)

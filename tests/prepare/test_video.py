@@ -138,6 +138,27 @@ def test_chapters_join_on_one_clock(tmp_path: Path) -> None:
     np.testing.assert_allclose(clicks, [0.5, 1.75, 3.5], atol=2 / RATE)
 
 
+@pytest.mark.parametrize(
+    ("codec", "options"),
+    [
+        ("libx264", {"bf": "3", "g": "24", "crf": "20", "x264-params": "open-gop=1:scenecut=0:b-pyramid=normal"}),
+        ("libx265", {"x265-params": "open-gop=1:keyint=24:bframes=4:log-level=none:pools=1:frame-threads=1"}),
+    ],
+)
+def test_frames_of_chapters_equal_a_sequential_decode(tmp_path: Path, codec: str, options: dict[str, str]) -> None:
+    if codec not in av.codecs_available:
+        pytest.skip(f"PyAV was built without {codec}")
+    paths = [
+        write_video(tmp_path / f"GX0{k}0007.MP4", 130, codec=codec, options=options, first_picture=130 * k)
+        for k in range(2)
+    ]
+    truth = [image for path in paths for image in sequential(path)]
+    for wanted in ([0, 128, 129, 130, 131, 259], [133], list(range(5, 260, 61))):
+        got = list(Recording(paths).frames(wanted))
+        assert [index for index, _ in got] == wanted
+        assert all(np.array_equal(image, truth[index]) for index, image in got)
+
+
 def test_a_gap_in_the_sound_between_chapters_is_silent_and_reported(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).uniform(-0.5, 0.5, RATE).astype(np.float32)
     paths = [
