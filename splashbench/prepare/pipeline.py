@@ -8,6 +8,7 @@ succeeded; its bytes do not depend on how often that was interrupted.
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -51,6 +52,7 @@ from splashbench.scene.writing import write_scene
 SHEET_COLUMNS = 6  # timesteps on the report's contact sheet
 WORK_FOLDER = "prepare"  # within the session
 _UNFINISHED = "unfinished_scene.txt"
+_STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-.+")
 
 ImageFormat = Literal["png", "jpg"]
 Image = NDArray[np.uint8]
@@ -86,7 +88,7 @@ def prepare(session_directory: Path, scene_directory: Path, options: Options | N
     work = options.work or session.directory / WORK_FOLDER
     with (
         open_stages(work, options.again_from) as store,
-        _unfinished_removed(work),
+        _unfinished_removed(work, scene_directory),
         atomic_directory(
             scene_directory, replace=options.replace, holds="train_meta.json", inputs=[session_directory, work]
         ) as made,
@@ -99,12 +101,15 @@ def prepare(session_directory: Path, scene_directory: Path, options: Options | N
 
 
 @contextmanager
-def _unfinished_removed(work: Path) -> Iterator[None]:
-    """Remove the half-written scene of a run that was killed; its place is noted in `work` while one is written."""
+def _unfinished_removed(work: Path, scene_directory: Path) -> Iterator[None]:
+    """Remove the half-written scene of a run that was killed; its place is noted in `work` while one is written.
+
+    Only beside the scene that is asked for now: a note in a stranger's session must not delete anything else.
+    """
     note = work / _UNFINISHED
     if note.is_file():
-        left = Path(note.read_text(encoding="utf-8"))
-        if left.name.startswith(".tmp-"):
+        left = Path(note.read_text(encoding="utf-8")[:4096])
+        if left.parent == Path(scene_directory).resolve().parent and _STAGED.fullmatch(left.name):
             shutil.rmtree(left, ignore_errors=True)
     yield
     note.unlink(missing_ok=True)

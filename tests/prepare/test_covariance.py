@@ -74,6 +74,7 @@ def remaining_errors(found: pycolmap.Reconstruction, truth: pycolmap.Reconstruct
     return np.linalg.norm(steps, axis=1), np.degrees(np.linalg.norm(turns, axis=1))
 
 
+@pytest.mark.slow
 def test_predicted_deviations_are_those_of_repeated_noise(truth: pycolmap.Reconstruction) -> None:
     rng = np.random.default_rng(4)
     squared_centre, squared_turn, predicted = [], [], []

@@ -114,6 +114,7 @@ def test_lens_of_rendered_frames(detector: BoardDetector) -> None:
     require_exact(found, lens)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [0.0, 0.0005], ids=["flat", "bent differently in every view"])
 def test_the_focal_deviation_is_what_repetitions_show(detector: BoardDetector, bend: float) -> None:
     rng = np.random.default_rng(11)

@@ -18,7 +18,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import write_text
 from splashbench.prepare.describe.board_guess import BoardGuess, guess_board
 from splashbench.prepare.describe.discovery import Film, Filmed, cameras_of, find_films
-from splashbench.prepare.describe.looking import Look, MarkerFinder, assign, look_at
+from splashbench.prepare.describe.looking import Look, MarkerFinder, assign, few_frames, look_at
 from splashbench.prepare.film.video import Recording
 from splashbench.prepare.session import DESCRIPTION
 from splashbench.progress import track
@@ -69,6 +69,9 @@ def _with_subjects(folder: Path, films: list[Film]) -> list[Film]:
     unnamed = [film for film in films if film.filmed is None]
     looks: dict[tuple[str, ...], Look] = {}
     finder = MarkerFinder()
+    board = next((film for film in films if film.filmed == "intrinsics"), None)
+    if unnamed and board is not None:  # sooner here than by trying every kind of marker on films without any
+        finder.settle(few_frames(Recording([folder / name for name in board.files])))
     for film in track(unnamed, "looking at films"):
         looks[film.files] = look_at([folder / name for name in film.files], finder)
     by_camera: dict[str, list[Film]] = {}

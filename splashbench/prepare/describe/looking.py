@@ -43,12 +43,17 @@ class Look:
     shift: float
 
 
+def few_frames(recording: Recording) -> list[NDArray[np.uint8]]:
+    """A few grey frames [H, W] of a recording, small and spread evenly."""
+    count = len(recording.frame_times)
+    indices = np.unique(np.linspace(0, count - 1, FRAMES).astype(int)).tolist()
+    return [_small(image) for _, image in recording.frames(indices)]
+
+
 def look_at(paths: Sequence[Path], finder: MarkerFinder) -> Look:
     """Look at a recording. Raises SplashbenchError where it cannot be read."""
     recording = Recording(paths)
-    count = len(recording.frame_times)
-    indices = np.unique(np.linspace(0, count - 1, FRAMES).astype(int)).tolist()
-    images = [_small(image) for _, image in recording.frames(indices)]
+    images = few_frames(recording)
     if finder.dictionary is None:
         finder.settle(images)
     middles = [middle for middle in (_marker_middle(finder.find(image)) for image in images) if middle is not None]
