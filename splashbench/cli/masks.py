@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,6 +65,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     drawing.add_argument(
         "--images", type=Path, metavar="FOLDER", help="<camera>/<frame>.png or .jpg; default: the scene's, else black"
     )
+    drawing.add_argument("--replace", action="store_true", help="replace SHEET.png where it exists")
     drawing.add_argument("--columns", type=_columns, default=8, metavar="N", help="instants to show (default: 8)")
     add_json(drawing)
     drawing.set_defaults(handler=sheet)
@@ -82,6 +84,7 @@ def compare(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         require_folder_place(arguments.out)
+        _require_apart(arguments.out, (arguments.raw, arguments.refined))
     comparisons = list(compare_folders(arguments.raw, arguments.refined))
     rows = change_rows(comparisons)
     header = ["scene", "camera", "masks", "IoU mean", "median", "added", "removed", "raw empty", "touched", "coverage"]
@@ -104,6 +107,15 @@ def compare(arguments: argparse.Namespace) -> int:
         ]
         emit({"raw": str(arguments.raw), "refined": str(arguments.refined), "rows": figures})
     return 0
+
+
+def _require_apart(out: Path, inputs: Iterable[Path | None]) -> None:
+    """Raise SplashbenchError where an output would lie among the masks or images that are looked at."""
+    from splashbench.errors import SplashbenchError
+
+    for source in inputs:
+        if source is not None and out.resolve().is_relative_to(source.resolve()):
+            raise SplashbenchError(f"{out} lies in {source}, which is looked at; give another place for the output")
 
 
 def _row(scene: str, camera: str, change: MaskChange) -> list[str]:
@@ -137,6 +149,9 @@ def sheet(arguments: argparse.Namespace) -> int:
     if arguments.out.suffix.lower() != ".png":
         raise SplashbenchError(f"{arguments.out} does not end in .png; name the picture so")
     require_file_place(arguments.out)
+    _require_apart(arguments.out, (arguments.masks, arguments.images))
+    if arguments.out.exists() and not arguments.replace:
+        raise SplashbenchError(f"{arguments.out} exists already; give another name, or --replace to replace it")
     if arguments.images is not None and not arguments.images.is_dir():
         raise SplashbenchError(f"{arguments.images} is not a folder; give that of <camera>/<frame>.png or .jpg")
     sets = find_mask_sets(arguments.masks)

@@ -19,8 +19,11 @@ SESSION holds session.toml and the cameras' own files: per camera a clip of the 
 static scene with the board lying flat on the table, and the pour with sound; and a handheld sweep of the static scene.
 SCENE appears only when every essential gate is passed; its prepare_report.html shows what was found.
 
-What a stage found is kept in SESSION/prepare. The next run does only what has changed, and goes on where one that was
-stopped had come to. Stages, in order: sync, motion, intrinsics, poses, metric, container, masks, scene.
+With --init, SCENE is left out, and --replace is for session.toml. Folders of photographs are not looked for: add them
+by hand.
+
+What a stage found last is kept in SESSION/prepare. The next run does only what has changed, and goes on where one that
+was stopped had come to. Stages, in order: sync, motion, intrinsics, poses, metric, container, masks, scene.
 """
 
 # As in session.toml (splashbench.prepare.session), repeated here so that `--help` need not import it.
@@ -149,7 +152,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.interval is not None:
         interval = (arguments.interval[0], arguments.interval[1])
         if not -1e6 < interval[0] < interval[1] < 1e6:
-            raise SplashbenchError(f"--interval {interval[0]} {interval[1]}: give seconds, START before END")
+            raise SplashbenchError(
+                f"--interval {interval[0]:g} {interval[1]:g}: give seconds, START before END, both below a million"
+            )
     options = Options(
         masks=arguments.masks,
         timesteps=arguments.timesteps,
@@ -172,13 +177,16 @@ def run(arguments: argparse.Namespace) -> int:
     say(table(["gate", "value", "limit", "outcome"], rows))
     for gate in preparation.warnings:
         say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}")
-    done = {name: record.seconds for name, record in preparation.stages.items() if not record.reused}
+    done = {name: record.spent for name, record in preparation.stages.items() if not record.reused}
     kept = [name for name, record in preparation.stages.items() if record.reused]
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in done.items())
     as_before = f"; as before: {', '.join(kept)}" if kept else ""
     say(f"wrote {arguments.scene} in {sum(done.values()):.0f} s ({spent}{as_before})")
     if arguments.json:
-        stages = {name: {"seconds": round(r.seconds, 3), "reused": r.reused} for name, r in preparation.stages.items()}
+        stages = {
+            name: {"seconds": round(r.seconds, 3), "spent": round(r.spent, 3), "reused": r.reused}
+            for name, r in preparation.stages.items()
+        }
         passed = not preparation.warnings
         emit({"scene": str(arguments.scene), "passed": passed, **preparation.as_json(), "stages": stages})
     return 0

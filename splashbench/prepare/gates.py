@@ -151,6 +151,8 @@ def metric_gates(frame: SceneFrame) -> list[Gate]:
     if frame.scale_disagreement is not None:
         detail = f"share, largest difference between {', '.join(frame.scales)}"
         gates.append(Gate("scale_agreement", frame.scale_disagreement, 0.01, "at most", detail))
+        beyond = f"as above; {frame.scale_source} would be taken, but one of them is wrong"
+        gates.append(Gate("scale_is_one", frame.scale_disagreement, 0.1, "at most", beyond, essential=True))
     return gates
 
 
@@ -199,6 +201,14 @@ def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -
         gates.append(
             Gate("container_sigma", placement.position_sigma, 2e-3, "at most", "m, its centre, by leaving out cameras")
         )
+    clicked = {name: error for name, error in (placement.point_rms_px or {}).items() if np.isfinite(error)}
+    if clicked:
+        worst = max(clicked, key=clicked.__getitem__)
+        detail = f"px RMS between clicked and projected points, camera {worst}"
+        gates.append(Gate("container_clicks", clicked[worst], max(5.0, width / 400), "at most", detail))
+        if not fitted:  # nothing else tells whether the clicks make sense
+            beyond = "as above; beyond this the clicks are of something else"
+            gates.append(Gate("container_clicks_fit", clicked[worst], width / 40, "at most", beyond, essential=True))
     up = np.asarray(placement.up)
     tilt = float(np.degrees(np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))))
     gates.append(Gate("container_upright", tilt, 2.0, "at most", "degrees between its axis and the scene's up"))

@@ -31,7 +31,7 @@ from splashbench.prepare.container import stage as container_stage
 from splashbench.prepare.container.stage import PlacedContainer
 from splashbench.prepare.crop import Box
 from splashbench.prepare.film import motion, sampling
-from splashbench.prepare.film.video import Recording
+from splashbench.prepare.film.video import Recording, probe
 from splashbench.prepare.masks import making as masking
 from splashbench.prepare.masks.provider import Mask
 from splashbench.prepare.masks.sheet import SheetCell, sheet_times, small_cell
@@ -108,7 +108,7 @@ def _unfinished_removed(work: Path, scene_directory: Path) -> Iterator[None]:
     """
     note = work / _UNFINISHED
     if note.is_file():
-        left = Path(note.read_text(encoding="utf-8")[:4096])
+        left = Path(note.read_bytes()[:4096].decode("utf-8", "replace"))
         if left.parent == Path(scene_directory).resolve().parent and _STAGED.fullmatch(left.name):
             shutil.rmtree(left, ignore_errors=True)
     yield
@@ -129,11 +129,12 @@ class _Run:
         """Run all stages; the scene is written into `directory`."""
         session, cameras = self.session, self.session.cameras
         recordings = rig.RigRecordings(session)
+        self._check_what_later_stages_need()
         # The cheap stages that most often find a fault come first.
         heard = self._listening()
         interval = self._interval(heard.clocks)
         sequence = self._left_over(heard.clocks, interval)
-        self._sampling(heard.clocks, interval)
+        sampled = self._sampling(heard.clocks, interval, "sampling_by_arrival")
         calibrations = self._calibrations(recordings)
         lenses = {camera: calibration.lens for camera, calibration in calibrations.items()}
         recordings.check_sizes(lenses, self.pour)
@@ -144,7 +145,8 @@ class _Run:
         placed = metric.transformed(posed.poses, frame.scene_from_sfm)
         paths = self._sound_paths(placed.w2c)
         clocks = sync.shifted(heard.clocks, paths.shift_s) if paths.applied else heard.clocks
-        sampled = self._sampling(clocks, interval)
+        if paths.applied:
+            sampled = self._sampling(clocks, interval, "sampling")
         gates = [
             *g.intrinsics_gates(calibrations),
             *g.sync_gates(clocks, sequence),
@@ -205,6 +207,15 @@ class _Run:
             overlays=self.overlays,
         )
 
+    def _check_what_later_stages_need(self) -> None:
+        """Faults that can be seen at once are told at once, not after the hours of the stages before."""
+        if self.session.container is not None:
+            container_stage.container_mesh(self.session)
+            sizes = {camera: probe(recording.paths[0]) for camera, recording in self.pour.items()}
+            container_stage.check_masks(self.session, {name: (i.width, i.height) for name, i in sizes.items()})
+        if self.options.masks is None and self.session.masks.provider == "sam3":
+            masking.sam3_provider(self.session, self.pour)
+
     @cached_property
     def pour(self) -> dict[str, Recording]:
         """Every camera's recording of the pour."""
@@ -241,7 +252,9 @@ class _Run:
             part="left_over",
         )
 
-    def _sampling(self, clocks: Mapping[str, ClockFit], interval: motion.MotionInterval) -> sampling.Sampling:
+    def _sampling(
+        self, clocks: Mapping[str, ClockFit], interval: motion.MotionInterval, part: str
+    ) -> sampling.Sampling:
         instants = sampling.sample_times(interval.interval, self.options.timesteps or self.session.timesteps)
         inputs = {"files": self._all_files, "clocks": clocks, "instants": instants}
         return self.store.result(
@@ -251,7 +264,7 @@ class _Run:
             lambda: sampling.sample_frames(
                 instants, {camera: found.frame_times for camera, found in self.pour.items()}, clocks
             ),
-            part="sampling",
+            part=part,
         )
 
     def _calibrations(self, recordings: rig.RigRecordings) -> dict[str, Calibration]:

@@ -134,12 +134,12 @@ class Masks(_Strict):
     """
 
     provider: Literal["background", "folder", "sam3"] = "background"
-    folder: str | None = None
+    folder: str | None = Field(default=None, min_length=1)
     checkpoint: str | None = Field(default=None, min_length=1, max_length=4096)
     text: str = Field(default="liquid", max_length=200)
     points: dict[str, Annotated[list[Click], Field(min_length=1, max_length=1000)]] = Field(default_factory=dict)
     confidence: float = Field(default=0.5, ge=0, lt=1)
-    container_folder: str | None = None
+    container_folder: str | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
     def _folder_goes_with_its_provider(self) -> Masks:
@@ -187,7 +187,7 @@ class Container(_Strict):
     """
 
     mesh: str
-    masks: str | None = None
+    masks: str | None = Field(default=None, min_length=1)
     points: list[ContainerPoint] = Field(default_factory=list, max_length=1000)
     metres_per_unit: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | Literal["unknown"] = 1.0
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None

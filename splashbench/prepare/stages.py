@@ -41,9 +41,11 @@ T = TypeVar("T")
 
 @dataclass
 class StageRecord:
-    """How long a stage took when it was made, in seconds, and whether this run took it as it was."""
+    """How long a stage took when it was made, how much of that in this run, in seconds; and whether this run took all
+    of it as it was."""
 
     seconds: float = 0.0
+    spent: float = 0.0
     reused: bool = True
 
 
@@ -60,19 +62,14 @@ class StageStore:
 
         kind: the result's type. part: what of the stage, such as a camera, where it has several parts.
         """
-        return self._obtain(stage, kind, inputs, part, make, lambda: None)
+        return self._obtain(stage, kind, inputs, part, make, None)
 
     def files(
         self, stage: Stage, kind: Any, inputs: Mapping[str, Any], make: Callable[[Path], T], part: str = ""
     ) -> tuple[Path, T]:
         """As `result`, for a stage that leaves files as well: `make` fills the empty folder that it is given."""
         folder = self._path(stage, part).with_suffix("")
-
-        def clear() -> None:
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
-
-        return folder, self._obtain(stage, kind, inputs, part, lambda: make(folder), clear)
+        return folder, self._obtain(stage, kind, inputs, part, lambda: make(folder), folder)
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
@@ -90,9 +87,7 @@ class StageStore:
         """Count what happens within towards the stage's time, as work that is never stored."""
         start = time.perf_counter()
         yield
-        record = self.records.setdefault(stage, StageRecord())
-        record.seconds += time.perf_counter() - start
-        record.reused = False
+        self._count(stage, time.perf_counter() - start)
 
     def forget(self, first: Stage) -> None:
         """Delete the results of `first` and of all stages after it."""
@@ -107,26 +102,33 @@ class StageStore:
         inputs: Mapping[str, Any],
         part: str,
         make: Callable[[], T],
-        before: Callable[[], None],
+        folder: Path | None,
     ) -> T:
         path = self._path(stage, part)
         key = self._key(stage, part, inputs)
-        record = self.records.setdefault(stage, StageRecord())
-        stored = _read(path, key, TypeAdapter(kind))
+        stored = _read(path, key, TypeAdapter(kind), folder)
         if stored is not None:
-            record.seconds += stored[0]
+            self.records.setdefault(stage, StageRecord()).seconds += stored[0]
             value: T = stored[1]
             return value
         path.unlink(missing_ok=True)  # before its files go: a result without its files must not be found
-        before()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
         start = time.perf_counter()
         made = make()
         seconds = time.perf_counter() - start
-        record.seconds += seconds
-        record.reused = False
+        self._count(stage, seconds)
+        content = {"key": key, "seconds": round(seconds, 3), "files": _sizes(folder), "result": _plain(made)}
         with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps({"key": key, "seconds": round(seconds, 3), "result": _plain(made)}))
+            temporary.write_text(json.dumps(content))
         return made
+
+    def _count(self, stage: Stage, seconds: float) -> None:
+        record = self.records.setdefault(stage, StageRecord())
+        record.seconds += seconds
+        record.spent += seconds
+        record.reused = False
 
     def _path(self, stage: Stage, part: str) -> Path:
         return self.folder / stage / f"{part}.json" if part else self.folder / f"{stage}.json"
@@ -144,7 +146,10 @@ def open_stages(folder: Path, again_from: Stage | None = None) -> Iterator[Stage
     """
     folder = Path(folder)
     try:
-        if folder.is_dir() and any(folder.iterdir()) and not (folder / _MARK_NAME).is_file():
+        if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+            raise SplashbenchError(f"{folder} is a link or a file, not a folder; name another place with --work")
+        # Whatever else is called README.txt: results are deleted here without asking.
+        if folder.is_dir() and any(folder.iterdir()) and not _is_ours(folder):
             raise SplashbenchError(f"{folder} holds something else; name another folder with --work")
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _MARK_NAME).write_text(_MARK, encoding="utf-8")
@@ -164,6 +169,18 @@ def open_stages(folder: Path, again_from: Stage | None = None) -> Iterator[Stage
         if again_from is not None:
             store.forget(again_from)
         yield store
+
+
+def _is_ours(folder: Path) -> bool:
+    mark = folder / _MARK_NAME
+    return mark.is_file() and mark.stat().st_size == len(_MARK.encode()) and mark.read_bytes() == _MARK.encode()
+
+
+def _sizes(folder: Path | None) -> dict[str, int]:
+    """The files of a stage's folder and their sizes."""
+    if folder is None or not folder.is_dir():
+        return {}
+    return {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
 
 
 def facts_of(paths: Iterable[Path]) -> list[tuple[str, int, int]]:
@@ -200,12 +217,13 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be stored")
 
 
-def _read(path: Path, key: str, adapter: TypeAdapter[Any]) -> tuple[float, Any] | None:
-    """(seconds, result) from a stored result with this key; None where there is none that can be read."""
+def _read(path: Path, key: str, adapter: TypeAdapter[Any], folder: Path | None) -> tuple[float, Any] | None:
+    """(seconds, result) from a stored result with this key; None where there is none that can be read, or where the
+    files in its `folder` are not those that it had."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        if stored["key"] != key:
+        if stored["key"] != key or stored["files"] != _sizes(folder):
             return None
         return float(stored["seconds"]), adapter.validate_python(stored["result"])
-    except (OSError, ValueError, KeyError, TypeError, ValidationError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
         return None

@@ -62,6 +62,12 @@ def test_sheet_is_written_and_names_what_fails(
     assert json.loads(captured.out)["faults"][camera.name]["3"] == "covers nearly everything"
     assert f"camera {camera.name}, frame 3: covers nearly everything" in captured.err
     assert read_image(out).shape[1] > 3 * 260
+    before = out.read_bytes()
+    assert main(["masks", "sheet", str(balls_copy), "--out", str(out), "--columns", "2"]) == 1
+    assert "sheet.png exists already" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    assert main(["masks", "sheet", str(balls_copy), "--out", str(out), "--columns", "2", "--replace"]) == 0
+    assert out.read_bytes() != before
 
 
 @pytest.mark.parametrize(
@@ -70,8 +76,10 @@ def test_sheet_is_written_and_names_what_fails(
         (["compare", "nowhere", "nowhere"], "nowhere is not a folder"),
         (["sheet", "nowhere", "--out", "sheet.png"], "nowhere is not a folder"),
         (["sheet", "nowhere", "--out", "sheet.jpg"], "sheet.jpg does not end in .png"),
-        (["sheet", ".", "--images", "nowhere", "--out", "sheet.png"], "nowhere is not a folder"),
-        (["sheet", ".", "--out", "sheet.png"], "has no masks"),
+        (["sheet", ".", "--images", "nowhere", "--out", "../sheet.png"], "nowhere is not a folder"),
+        (["sheet", ".", "--out", "../sheet.png"], "has no masks"),
+        (["sheet", ".", "--out", "sheet.png"], "sheet.png lies in ., which is looked at"),
+        (["compare", ".", ".", "--out", "comparison"], "comparison lies in ., which is looked at"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -83,6 +83,8 @@ def test_a_folder_per_camera_and_subject(tmp_path: Path) -> None:
         (("cam3_pour.mp4",), "cam3", "pour", 1),
         (("3/calibration.MOV",), "3", "intrinsics", 1),
         (("GH010001.MP4",), "", None, 1),
+        (("take 2/cam 1/GX010004.MP4",), "cam_1", None, 1),
+        (("cam1/pour 2/GX010004.MP4",), "cam1", "pour", 1),
     ],
 )
 def test_ways_to_name_files(

@@ -14,6 +14,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import trimesh
 
 from splashbench import toml
 from splashbench.cli.main import main
@@ -159,6 +160,44 @@ def test_recordings_that_calibration_needs_are_asked_for(session: Path) -> None:
     fails(session, r"session\.toml: camera 1 has no static recording")
     edit(session, recordings={"pour": recordings["pour"]}, board=None)
     fails(session, r"session\.toml: no \[board\]")
+
+
+def test_only_the_own_unfinished_scene_is_removed(session: Path) -> None:
+    """The note in the work folder may come from a stranger."""
+    victim = session.parent / "elsewhere" / ".tmp-01234567-scene"
+    victim.mkdir(parents=True)
+    left = session.parent / ".tmp-89abcdef-scene"
+    left.mkdir()
+    with pytest.raises(SplashbenchError):
+        prepare(session, session.parent / "scene")  # makes the work folder
+    for note in (str(victim).encode(), b"\xff\xfe", str(left).encode()):
+        (session / "prepare/unfinished_scene.txt").write_bytes(note)
+        with pytest.raises(SplashbenchError):
+            prepare(session, session.parent / "scene")
+    assert victim.is_dir()
+    assert not left.exists()
+
+
+def test_faults_of_later_stages_are_told_first(session: Path, tmp_path: Path) -> None:
+    def fault(pattern: str, **changes) -> None:
+        edit(session, **changes)
+        with pytest.raises(SplashbenchError, match=pattern):
+            prepare(session, tmp_path / "scene")
+        assert not (session / "prepare/sync.json").exists()
+
+    (session / "bowl.ply").write_text("no mesh")
+    (session / "bowls").mkdir()
+    fault(r"bowl\.ply is not a readable mesh", container={"mesh": "bowl.ply", "masks": "bowls"})
+    trimesh.creation.box().export(session / "bowl.ply")
+    fault("no mask of a training camera")
+    write_png(session / "bowls/1.png", np.zeros((4, 4), np.uint8))
+    fault(r"bowls/1\.png is 4x4, the recording is 128x72")
+    clicks = [{"point": [k, 0, k * k], "pixels": {"1": [10 + k, 900 * (k == 2)]}} for k in range(3)]
+    fault(r"point 3 lies at \(12, 900\) in camera 1", container={"mesh": "bowl.ply", "points": clicks})
+    fault(r"unknown marker dictionary", container=None, marker={"dictionary": "DICT_NOPE", "id": 1, "metres": 0.1})
+    fault(r"has no marker 77", marker={"dictionary": "DICT_4X4_50", "id": 77, "metres": 0.1})
+    fault(r"is also on the board", marker={"dictionary": "DICT_4X4_1000", "id": 3, "metres": 0.1})
+    fault(r"sam3", marker=None, masks={"provider": "sam3", "checkpoint": "nowhere/sam3"})
 
 
 def test_a_folder_that_is_no_session(session: Path) -> None:

@@ -163,7 +163,8 @@ def test_a_result_that_cannot_be_read_is_made_anew(store: StageStore) -> None:
     store.result("sync", SequenceSync, {}, lambda: SequenceSync(0.1, {"1": 0.1}, ()))
     path = store.folder / "sync.json"
     whole = json.loads(path.read_text())
-    for text in ("", "{", "[]", json.dumps({**whole, "result": {"rms_s": "x"}}), json.dumps({**whole, "key": "0"})):
+    others = [json.dumps({**whole, **change}) for change in ({"result": {"rms_s": "x"}}, {"key": "0"})]
+    for text in ("", "{", "[]", "[" * 100_000, *others):
         path.write_text(text)
         assert store.result("sync", SequenceSync, {}, lambda: SequenceSync(0.2, {}, ())).rms_s == 0.2
 
@@ -198,7 +199,50 @@ def test_the_folder_is_one_process_own_and_nobody_elses(tmp_path: Path) -> None:
     (tmp_path / "photographs/holiday.jpg").touch()
     refused(tmp_path / "photographs", "photographs holds something else; name another folder with --work")
     (tmp_path / "file").touch()
-    refused(tmp_path / "file", "file cannot be written")
+    refused(tmp_path / "file", "is a link or a file, not a folder")
+    (tmp_path / "link").symlink_to(tmp_path / "work")
+    refused(tmp_path / "link", "is a link or a file, not a folder")
+
+
+def test_a_folder_with_a_readme_of_its_own_is_not_ours(tmp_path: Path) -> None:
+    """Results are deleted without asking, so nothing else may be taken for them."""
+    (tmp_path / "README.txt").write_text("my notes")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks/1.png").write_text("mine")
+    with (
+        pytest.raises(SplashbenchError, match="holds something else"),
+        open_stages(tmp_path, again_from="sync") as store,
+    ):
+        store.forget("sync")
+    assert (tmp_path / "README.txt").read_text() == "my notes"
+    assert (tmp_path / "masks/1.png").read_text() == "mine"
+
+
+def test_a_file_that_went_missing_or_changed_is_made_anew(store: StageStore) -> None:
+    def make(folder: Path) -> int:
+        for name in "ab":
+            (folder / name).write_text(name)
+        return len(list(folder.iterdir()))
+
+    folder, _ = store.files("masks", int, {}, make, part="1")
+    for spoil in (lambda: (folder / "a").unlink(), lambda: (folder / "b").write_text("longer")):
+        spoil()
+        store.files("masks", int, {}, make, part="1")
+        assert [(folder / name).read_text() for name in "ab"] == ["a", "b"]
+    store.files("masks", int, {}, lambda _: pytest.fail("nothing was spoilt"), part="1")
+
+
+def test_time_is_counted_for_what_was_done(tmp_path: Path) -> None:
+    with open_stages(tmp_path) as store:
+        store.result("masks", int, {}, lambda: time.sleep(0.02) or 1, part="1")
+        first = store.records["masks"]
+        assert first.spent == first.seconds >= 0.02
+    with open_stages(tmp_path) as store:
+        store.result("masks", int, {}, lambda: 1, part="1")
+        store.result("masks", int, {}, lambda: 2, part="2")
+        again = store.records["masks"]
+        assert not again.reused
+        assert again.spent < again.seconds
 
 
 CHAIN = """

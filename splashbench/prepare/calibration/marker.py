@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.calibration.board import SMALL_IMAGE_WIDTH, BoardView
+from splashbench.prepare.calibration.board import SMALL_IMAGE_WIDTH, BoardLayout, BoardView
 from splashbench.prepare.calibration.lens import Array
 
 
@@ -28,6 +28,21 @@ class MarkerLayout(Protocol):
 def marker_corners(metres: float) -> Array:
     """The corners of a marker with sides of `metres`: [4, 2], clockwise from its top left, x right, y down."""
     return metres * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+def is_on_board(marker: MarkerLayout, board: BoardLayout) -> bool:
+    """Whether the board carries a marker of the same pattern, in whatever dictionary either is named: the board's would
+    be taken for the marker."""
+    if board.dictionary is None:
+        return False
+    wanted, carried = (
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in (marker.dictionary, board.dictionary)
+    )
+    if wanted.markerSize != carried.markerSize:
+        return False
+    # bytesList: [markers, bytes, 4 turns of the marker].
+    turns = carried.bytesList[: board.squares_x * board.squares_y // 2]
+    return bool((turns == wanted.bytesList[marker.id][None, :, :1]).all(axis=1).any())
 
 
 class MarkerDetector:

@@ -21,7 +21,7 @@ from splashbench.prepare.container.points import Click, place_by_points
 from splashbench.prepare.masks.provider import Mask, read_raw_mask
 from splashbench.prepare.posing.metric import GRAVITY
 from splashbench.prepare.posing.scale import Upright
-from splashbench.prepare.session import Session
+from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, read_mesh
 
@@ -45,6 +45,31 @@ def container_masks(folder: Path | None, undistorters: Mapping[str, Undistorter]
         if path.is_file():
             found[camera] = undistorter.mask(read_raw_mask(path, undistorter.lens.width, undistorter.lens.height))
     return found
+
+
+def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Raise SplashbenchError for a container mask of another size than the recording's (width, height), for clicks
+    outside the frames, and where no training camera has a mask and there are no clicks."""
+    described, folder = session.container, session.container_folder
+    assert described is not None
+    for number, click in enumerate(described.points, 1):
+        for camera, (u, v) in click.pixels.items():
+            width, height = sizes[camera]
+            if not (0 <= u <= width and 0 <= v <= height):
+                raise SplashbenchError(
+                    f"{session.directory / DESCRIPTION}: [container] point {number} lies at ({u:g}, {v:g}) in camera"
+                    f" {camera}, whose frames are {width}x{height}; give pixels of the raw frame"
+                )
+    found = []
+    for camera in session.cameras if folder is not None else ():
+        path = Path(folder or "") / f"{camera}.png"
+        if path.is_file():
+            read_raw_mask(path, *sizes[camera])
+            found.append(camera)
+    if not described.points and not any(camera in session.train for camera in found):
+        raise SplashbenchError(
+            f"{folder}: no mask of a training camera, named <camera>.png; give some, or points under [container]"
+        )
 
 
 def place_container(
@@ -83,7 +108,7 @@ def _place(
             up=described.up or "y",
             metres_per_unit=metres_per_unit,
             masks=seen,
-            source=f"{session.directory / 'session.toml'}: [container] points",
+            source=f"{session.directory / DESCRIPTION}: [container] points",
         )
     if seen:
         placement = place_by_silhouettes(

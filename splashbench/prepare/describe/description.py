@@ -188,5 +188,5 @@ def _board_text(board: BoardGuess | None, square_metres: float | None) -> str:
         )
     return text + (
         f"square_metres = {square_metres}\n"
-        f"marker_metres = {round(square_metres * board.marker_share, 5)}   # seen; measure it\n"
+        f"marker_metres = {round(square_metres * board.marker_share, 5)}   # seen, to a few percent; measure it\n"
     )

@@ -28,11 +28,11 @@ _LATER_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*GP(?P<chapter>\d{2})(?P<num
 _WORDS: dict[Filmed, tuple[str, ...]] = {
     "intrinsics": ("intrinsics", "intrinsic", "calibration", "calib", "board", "charuco", "checkerboard", "lens"),
     "static": ("static", "background", "empty", "extrinsics", "extrinsic", "poses"),
-    "pour": ("pour", "pouring", "liquid", "splash", "fluid", "recording", "take"),
+    "pour": ("pour", "pouring", "liquid", "splash", "fluid", "recording"),
     "sweep": ("sweep", "handheld", "scan", "walk"),
 }
 # Folders that a camera's card or a tidy person makes, which name no camera.
-_PLAIN = re.compile(r"^(cameras?|videos?|raw|dcim|\d{3}gopro|films?|footage)$", re.IGNORECASE)
+_PLAIN = re.compile(r"^(cameras?|videos?|raw|dcim|\d{3}gopro|films?|footage|takes?_?\d*)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,8 @@ def _camera_and_subject(words: Sequence[str]) -> tuple[str, Filmed | None]:
                 rest.append(part)
             else:
                 filmed = subject
+        if len(rest) < len(parts) and all(part.isdigit() for part in rest):
+            continue  # "pour 2" is the second pour, not camera 2
         if rest and not _PLAIN.match("_".join(rest)):
             kept.append("_".join(rest))
     camera = re.sub(r"[^A-Za-z0-9_-]", "", "-".join(kept)).strip("_-")[:64]

@@ -42,7 +42,7 @@ def choose_provider(
     """
     folder = session.mask_folder if asked is None else None if asked == "background" else Path(asked)
     if asked is None and session.masks.provider == "sam3":
-        return _sam3(session, pour)
+        return sam3_provider(session, pour)
     if folder is not None:
         if not folder.is_dir():
             raise SplashbenchError(f"{folder} is not a folder of masks; give one, or --masks background")
@@ -56,7 +56,8 @@ def choose_provider(
     return BackgroundMasks(lambda camera, indices: pour[camera].frames(indices), quiet, sources)
 
 
-def _sam3(session: Session, pour: Mapping[str, Recording]) -> MaskProvider:
+def sam3_provider(session: Session, pour: Mapping[str, Recording]) -> MaskProvider:
+    """Masks by SAM3 as the session describes them. Raises SplashbenchError where the checkpoint or a click is none."""
     from splashbench.prepare.masks.sam3 import Sam3Masks
 
     described = session.masks

@@ -15,10 +15,10 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
-import pycolmap
 from scipy import linalg, sparse
 
 from splashbench.prepare.calibration.lens import Array
+from splashbench.prepare.posing.colmap import pycolmap
 
 _STEP = 1e-6  # of central differences, relative to the depth or to the parameter
 # Of each model's parameters, the principal point's, which bundle adjustment does not always refine.

@@ -14,7 +14,7 @@ from splashbench.prepare.calibration.board import BoardView, Detector
 from splashbench.prepare.calibration.checkerboard import board_detector, numbered_alike
 from splashbench.prepare.calibration.intrinsics import Calibration, calibrate, focal_guess, frames_to_search
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.calibration.marker import MarkerDetector
+from splashbench.prepare.calibration.marker import MarkerDetector, is_on_board
 from splashbench.prepare.film.stills import Stills, open_recording
 from splashbench.prepare.film.video import Recording
 from splashbench.prepare.posing import metric, poses, scale
@@ -49,6 +49,13 @@ class RigRecordings:
             )
         self.session = session
         self.detector = board_detector(session.board)
+        if session.marker is not None:
+            MarkerDetector(session.marker)  # is there such a marker?
+            if is_on_board(session.marker, session.board):
+                raise SplashbenchError(
+                    f"{session.directory / DESCRIPTION}: marker {session.marker.id} of [marker] is also on the board;"
+                    " lay another one"
+                )
         self.boards = {camera: open_recording(session.paths("intrinsics", camera)) for camera in session.cameras}
         self.static = {camera: open_recording(session.paths("static", camera)) for camera in session.cameras}
         self.sweep = open_recording(session.sweep_paths) if session.sweep_paths else None
