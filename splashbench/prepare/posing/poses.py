@@ -25,6 +25,7 @@ from splashbench.prepare.calibration.lens import Array, Lens
 from splashbench.prepare.posing.colmap import pycolmap
 from splashbench.prepare.posing.covariance import PoseSigmas, pose_sigmas
 from splashbench.prepare.posing.mapping import SWEEP_FOLDER, map_images, match, quiet_colmap, refine, require_posed
+from splashbench.progress import Bar
 
 SWEEP_FRAMES = 25
 
@@ -97,12 +98,21 @@ def estimate_poses(
     of all. `threads`: 1 gives the same result each time. Raises SplashbenchError naming the cameras that could not be
     posed.
     """
-    with quiet_colmap():
-        workplace = match(static, lenses, sweep, work, sweep_focal, threads)
-        mapped = require_posed(workplace, map_images(workplace))
-        principal = refine(mapped.reconstruction, workplace)
-        names = list(workplace.names.values())
-        sigmas = pose_sigmas(mapped.reconstruction, names, workplace.held_cameras, principal)
+    bar = Bar("structure from motion")
+    try:
+        with quiet_colmap():
+            bar.update(0.0, f"features of {len(static) + len(sweep)} images")
+            workplace = match(static, lenses, sweep, work, sweep_focal, threads)
+            bar.update(0.6, "mapping")
+            mapped = require_posed(workplace, map_images(workplace))
+            bar.update(0.8, "refining")
+            principal = refine(mapped.reconstruction, workplace)
+            bar.update(0.9, "deviations")
+            names = list(workplace.names.values())
+            sigmas = pose_sigmas(mapped.reconstruction, names, workplace.held_cameras, principal)
+            bar.update(1.0)
+    finally:
+        bar.close()
     free = [camera for camera in static if camera not in lenses]
     return _collect(mapped.reconstruction, workplace.names, free, len(sweep), sigmas, mapped.attempts)
 
