@@ -287,6 +287,7 @@ def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_only_what_changed_is_done_again(made_up: Path, tmp_path: Path) -> None:
     session = Path(shutil.copytree(made_up, tmp_path / "session"))
+    shutil.rmtree(session / "prepare", ignore_errors=True)  # of other tests
     options = Options(timesteps=5)
     first = prepare(session, tmp_path / "first", options)
     again = prepare(session, tmp_path / "again", options)
