@@ -43,6 +43,13 @@ def _sibling(path: Path) -> Path:
     return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{path.name}")
 
 
+def is_staged_for(path: Path, output: Path) -> bool:
+    """Whether `path` has the place and name of a staging folder for `output`: what a killed process may leave."""
+    output = Path(output).resolve()
+    staged = _STAGED.match(path.name)
+    return path.parent == output.parent and staged is not None and path.name[staged.end() :] == output.name
+
+
 def as_asked(path: Path | str) -> str:
     """`path` under the name the user knows, not that of its staging place."""
     return _STAGED.sub("", str(path))
