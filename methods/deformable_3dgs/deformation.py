@@ -44,6 +44,13 @@ class Deformation(nn.Module):
         )
         self.shift, self.turn, self.growth = nn.Linear(width, 3), nn.Linear(width, 4), nn.Linear(width, 3)
 
+    def silence(self) -> None:
+        """Zero the heads: nothing moves until the fit says so. As published, the start is a random deformation."""
+        with torch.no_grad():
+            for head in (self.shift, self.turn, self.growth):
+                head.weight.zero_()
+                head.bias.zero_()
+
     def forward(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
         positions = (positions - self.center) / self.unit
         times = positions.new_full((1, 1), time)

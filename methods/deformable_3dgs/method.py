@@ -24,16 +24,16 @@ from splashbench.scene import TrainingScene
 
 def rates(settings: Settings, extent: float) -> dict[str, Rate]:
     """Learning rates by table; `extent` of the cameras, scene units."""
-    factor = settings.rate_factor
+    factor, network, color = settings.rate_factor, settings.network_factor, 2.5e-3 * settings.color_factor
     position = 1.6e-4 * extent * factor
     published = {
         "positions": Rate(position, position / 100, until=0.75),
         "log_scales": Rate.constant(5e-3),
         "quaternions": Rate.constant(1e-3),
         "opacity_logits": Rate.constant(0.05),
-        "constant": Rate.constant(2.5e-3),
-        "rest": Rate.constant(2.5e-3 / 20),
-        "deformation": Rate(8e-4 * factor, 1.6e-6 * factor, begin=settings.warm_up),
+        "constant": Rate.constant(color),
+        "rest": Rate.constant(color / 20),
+        "deformation": Rate(8e-4 * network, 1.6e-6 * network, begin=settings.warm_up),
     }
     if settings.rates == "published":
         return published
@@ -55,8 +55,8 @@ class Deformable3DGS(Method):
             torch.manual_seed(run.seed)
             with run.stage("start"):
                 static = static_points(scene, config.static_points, config.static, rng)
-                # One canonical set for all times: the hulls of all frames share the points.
-                liquid = hull_points(scene, -(-config.hull_points // scene.n_frames), rng)
+                # One canonical set for all times: points of several frames would all be there in every one.
+                liquid = hull_points(scene, config.hull_points, rng, largest_only=True)
                 start = joined(static, liquid)
             model = DeformableModel.from_start(
                 start, config.start_opacity, config.sh_degree, config.depth, config.width

@@ -59,6 +59,7 @@ class DeformableModel(DynamicModel):
             model.log_scales.copy_(torch.from_numpy(start.spacing).log()[:, None].expand(-1, 3))
             model.opacity_logits.fill_(float(torch.logit(torch.tensor(opacity))))
             low, high = (torch.from_numpy(np.quantile(start.positions, q, axis=0)) for q in (0.02, 0.98))
+            model.deformation.silence()
             model.deformation.center.copy_((low + high) / 2)
             model.deformation.unit.copy_((high - low).max() / (2 * _BOX))
             model.constant.copy_(harmonics.constant_of(torch.from_numpy(start.colors)))

@@ -122,6 +122,10 @@ class DensityControl:
         self._changed(new)
         self._replace(bright, new)
 
+    def append(self, new: dict[str, Tensor]) -> None:
+        """Add primitives from elsewhere: rows of every table."""
+        self._replace(np.ones(len(self.optimizer.model.get_parameter("positions")), bool), new)
+
     def _replace(self, keep: np.ndarray, new: dict[str, Tensor]) -> None:
         model = self.optimizer.model
         if not new:

@@ -55,6 +55,11 @@ class Photographs:
             self._queue = self._epoch()
         return [self.photograph(name, t) for name, t in self._queue.pop()]
 
+    def some(self, count: int) -> list[Photograph]:
+        """At most `count` photographs, chosen at random, apart from the order of `next`."""
+        pairs = [(name, t) for name in self._cameras for t in range(self._scene.n_frames)]
+        return [self.photograph(*pairs[i]) for i in self._rng.permutation(len(pairs))[:count]]
+
     def _epoch(self) -> list[list[tuple[str, int]]]:
         groups = []
         names = list(self._cameras)

@@ -27,6 +27,7 @@ class SplattingSettings(MethodConfig):
         prune_until: share until which faint ones are dropped.
         reset_every: steps between opacity resets, 0 for never; reset_until: share after which there are none.
         rate_factor: times the published learning rates of where Gaussians are and how they move.
+        color_factor: times the published learning rates of colours and features.
         rates: whether every learning rate falls to a tenth ("short"), or as published.
         longest_side: photographs are shrunk to this many pixels.
     """
@@ -46,6 +47,7 @@ class SplattingSettings(MethodConfig):
     reset_every: int = Field(default=0, ge=0)
     reset_until: float = Field(default=0.6, ge=0, le=1)
     rate_factor: float = Field(default=1.0, gt=0, le=1000)
+    color_factor: float = Field(default=1.0, gt=0, le=1000)
     rates: Literal["short", "published"] = "short"
     longest_side: int = Field(default=400, ge=16, le=16384)
 

@@ -60,8 +60,11 @@ def static_points(
     return Start(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
 
 
-def hull_points(scene: TrainingScene, per_frame: int, rng: np.random.Generator) -> Start:
-    """At most `per_frame` points below the surface of the liquid's hull in every frame, in the colours of the views."""
+def hull_points(scene: TrainingScene, count: int, rng: np.random.Generator, largest_only: bool = False) -> Start:
+    """Some `count` points below the surface of the liquid's hull, in the colours of the views.
+
+    They are spread evenly over the frames or, with `largest_only`, all of the frame in which there is most of it.
+    """
     parts: list[Start] = []
     try:
         fields = signed_distance_fields(scene, cells_longest_axis=_HULL_CELLS)
@@ -69,8 +72,11 @@ def hull_points(scene: TrainingScene, per_frame: int, rng: np.random.Generator) 
         if any(scene.mask(name, t).any() for name in scene.train for t in range(scene.n_frames)):
             raise
         return _joined(parts)  # no liquid in any frame: the static scene is all there is
-    for t in range(scene.n_frames):
-        skin = np.argwhere((fields.phi[t] < 0) & (fields.phi[t] > -_SKIN))
+    skins = [np.argwhere((phi < 0) & (phi > -_SKIN)) for phi in fields.phi]
+    frames = [int(np.argmax([len(skin) for skin in skins]))] if largest_only else range(scene.n_frames)
+    per_frame = -(-count // len(frames))
+    for t in frames:
+        skin = skins[t]
         if len(skin) == 0:
             continue
         chosen = skin[rng.permutation(len(skin))[:per_frame]]

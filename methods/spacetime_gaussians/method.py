@@ -13,6 +13,7 @@ from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted
 from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
 from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
 from splashbench_methods.gaussian_splatting.start import camera_extent, hull_points, joined, static_points
+from splashbench_methods.spacetime_gaussians.guided import GuidedDensity
 from splashbench_methods.spacetime_gaussians.model import SpacetimeModel
 from splashbench_methods.spacetime_gaussians.settings import Settings
 from torch import Tensor
@@ -24,7 +25,7 @@ from splashbench.scene import TrainingScene
 
 def rates(settings: Settings, extent: float, full: bool) -> dict[str, Rate]:
     """Learning rates by table; `extent` of the cameras, scene units."""
-    factor = settings.rate_factor
+    factor, color = settings.rate_factor, settings.color_factor
     position, motion = 1.6e-4 * extent * factor, 2.8e-4 * extent * factor
     published = {
         "positions": Rate(position, position / 100),
@@ -35,13 +36,13 @@ def rates(settings: Settings, extent: float, full: bool) -> dict[str, Rate]:
         "opacity_logits": Rate.constant(0.05),
         "times": Rate.constant(1e-4),
         "log_widths": Rate.constant(0.03),
-        "base": Rate.constant(2.5e-3),
+        "base": Rate.constant(2.5e-3 * color),
     }
     if full:
         published |= {
-            "features": Rate.constant(2.5e-3),
-            "time_features": Rate.constant(1e-3),
-            "decoder": Rate.constant(1e-4),
+            "features": Rate.constant(2.5e-3 * color),
+            "time_features": Rate.constant(1e-3 * color),
+            "decoder": Rate.constant(1e-4 * color),
         }
     if settings.rates == "published":
         return published
@@ -64,17 +65,19 @@ class SpacetimeGaussians(Method):
             torch.manual_seed(run.seed)
             with run.stage("start"):
                 static = static_points(scene, config.static_points, config.static, rng)
-                start = joined(static, hull_points(scene, -(-config.hull_points // scene.n_frames), rng))
+                start = joined(static, hull_points(scene, config.hull_points, rng))
             times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
             model = SpacetimeModel.from_start(start, self.full, config.start_opacity, config.hull_log_width, times)
             extent = camera_extent(scene)
             optimizer = RowOptimizer(model, rates(config, extent, self.full), model.rows, config.iterations)
+            photographs = Photographs(scene, config.longest_side, config.views_per_step, rng)
+            density = DensityControl(optimizer, config.density(extent), _new_times)
             with run.stage("fit"):
                 history = fit_dynamic(
                     model,
                     optimizer,
-                    DensityControl(optimizer, config.density(extent), _new_times),
-                    Photographs(scene, config.longest_side, config.views_per_step, rng),
+                    GuidedDensity(density, model, photographs, config, rng),
+                    photographs,
                     lambda done: run.progress(done, f"fitting {len(model.positions)} Gaussians"),
                 )
         return MixedFitted(model, scene, history)

@@ -78,6 +78,7 @@ class SpacetimeModel(DynamicModel):
             model.base.copy_(torch.logit(colors.clamp(0.01, 0.99)) if full else colors)
             if full:
                 model.features.copy_(colors)
+                model.decoder[2].weight.zero_()  # the fit begins with the points' own colours
         return model
 
     def at(self, time: float) -> State:

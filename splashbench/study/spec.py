@@ -44,11 +44,14 @@ class SceneEntry(_Model):
 class Variant(_Model):
     """One row of the table: what it changes. `paper`: its name in leaderboards/paper.csv.
 
+    method: another one than the study's, with its own preset (the first, unless named) and settings; `base` is not its.
+
     train_views: a number (nested subsets that bracket the test views) or the names of the training views kept.
     """
 
     name: str = Field(pattern=_NAME)
     note: str = ""
+    method: str | None = None
     preset: str | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     perturbation: tuple[Perturbation, ...] = ()
@@ -71,7 +74,7 @@ class Paper(_Model):
 
 
 class StudySpec(_Model):
-    """A whole study. `base`: settings of every row, on top of its preset: the budget, stated once.
+    """A whole study. `base`: settings of every row of `method`, on top of its preset: the budget, stated once.
 
     reference: false in TOML leaves the control out. timeout_seconds: for each fit, and again for each rendering.
     """
