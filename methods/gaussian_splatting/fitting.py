@@ -49,7 +49,7 @@ class History:
     psnr: NDArray[np.float32]
 
     def gained_in_last_quarter(self) -> float:
-        """What the last quarter of the steps gained, dB: the mean of its second half minus that of the eighth before it."""
+        """What the last quarter of the steps gained, dB: the mean of its second half, over the eighth before it."""
         steps = len(self.psnr)
         eighth = max(1, steps // 8)
         return float(self.psnr[steps - eighth :].mean() - self.psnr[steps - 3 * eighth : steps - 2 * eighth].mean())
