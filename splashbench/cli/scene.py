@@ -86,12 +86,12 @@ def _register_export(actions: argparse._SubParsersAction) -> None:
     action.set_defaults(handler=export)
 
 
-def add_points(parser: argparse._ActionsContainer) -> None:
+def add_points(parser: argparse._ActionsContainer, default: int | None = POINTS) -> None:
     """Add `--points`, the number of initial points of the liquid."""
     parser.add_argument(
         "--points",
         type=_not_negative,
-        default=POINTS,
+        default=default,
         metavar="N",
         help=f"initial points of the liquid in each timestep, from the masks' visual hull (default {POINTS}; 0: none)",
     )
