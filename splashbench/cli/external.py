@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splashbench.cli.output import say
 from splashbench.cli.scene import add_points
 
 if TYPE_CHECKING:
@@ -87,7 +88,12 @@ def run(arguments: argparse.Namespace) -> Submission:
     from splashbench.adapter.external import ExternalCode, run_external
     from splashbench.adapter.runner import TIMING_FRAMES
     from splashbench.cli.scene import POINTS
+    from splashbench.scene import Scene
+    from splashbench.scene.exporting import remarks
 
+    # The run puts the export into such a folder.
+    for note in remarks(Scene.open(arguments.scene), arguments.format, Path("NeRF", "scene")):
+        say(f"note: {note}")
     code = ExternalCode(
         name=arguments.name,
         command=arguments.fit_command,

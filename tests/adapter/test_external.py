@@ -144,7 +144,9 @@ def test_a_failure_is_exit_1_and_keeps_the_last_lines(
 ) -> None:
     arguments = ["run", "external", str(balls_directory), str(tmp_path / "out"), "--name", "theirs"]
     assert main([*arguments, "--format", "blender", "--command", _fit("crash"), "--points", "0"]) == 1
-    assert capsys.readouterr().err.startswith("error: theirs: crashed: the fit ended with exit code 1")
+    note, error = capsys.readouterr().err.splitlines()
+    assert note.startswith("note: principal points lie up to 2.7 pixels off the middle")
+    assert error.startswith("error: theirs: crashed: the fit ended with exit code 1")
     assert read_json(tmp_path / "out" / "record.json")["log_tail"] == ["fitting crash", "the matrix is singular"]
 
 

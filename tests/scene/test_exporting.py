@@ -313,7 +313,12 @@ def test_the_command_says_what_was_written_and_what_to_know(
     assert any("principal points lie up to 2.7 pixels off" in remark for remark in told["remarks"])
     assert "2 test views without images" in err
     assert main([*arguments[:3], str(tmp_path / "frames"), "--format", "colmap", "--points", "20"]) == 0
-    assert "note: COLMAP's layout counts frames: steps that are uneven by up to" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "note: COLMAP's layout counts frames: steps that are uneven by up to" in err
+    assert "simultaneous" not in err
+    late = write_balls_scene(tmp_path / "late", delays={"3": 0.004})
+    assert main([*arguments[:2], str(late.directory), str(tmp_path / "late_frames"), "--format", "colmap"]) == 0
+    assert "cameras that expose up to 4.0 ms apart" in capsys.readouterr().err
     with pytest.raises(SystemExit) as stop:
         main([*arguments, "--format", "blender", "--with-test-images", "--blank-test-images"])
     assert stop.value.code == 2

@@ -72,10 +72,12 @@ def remarks(scene: Scene, format_name: str, out: Path) -> list[str]:
         steps = np.diff(np.stack([scene.camera_times[name] for name in scene.cameras]), axis=1)
         uneven = float(np.abs(steps / steps.mean() - 1).max()) if steps.size else 0.0
         delay = max(float(np.abs(own - scene.times).max()) for own in scene.camera_times.values())
-        if uneven > _UNEVEN or (steps.size and delay > _UNEVEN * steps.mean()):
+        if uneven > _UNEVEN:
+            found.append(f"COLMAP's layout counts frames: steps that are uneven by up to {uneven:.0%} become even")
+        if steps.size and delay > _UNEVEN * steps.mean():
             found.append(
-                f"COLMAP's layout counts frames: steps that are uneven by up to {uneven:.0%} and cameras that expose "
-                f"up to {1000 * delay:.1f} ms apart from the scene's times become even and simultaneous"
+                f"COLMAP's layout has one time per frame: cameras that expose up to {1000 * delay:.1f} ms apart from "
+                "the scene's times become simultaneous"
             )
         moved = max(
             float(np.abs(camera.w2c[:3, :3] - nearest_rotation(camera)).max() * camera.K[0, 0])
