@@ -17,7 +17,8 @@ import numpy as np
 
 from splashbench.adapter.contract import Fitted, Method, Render, Run
 from splashbench.adapter.discovery import load_method
-from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
+from splashbench.adapter.importers import Importer, load_importer
+from splashbench.adapter.messages import DISK_FULL_EXIT, Failure, Outcome, Request
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import raise_if_disk_full, read_model, write_model
 from splashbench.processes import end_with_parent
@@ -29,21 +30,18 @@ WARM_UP_FRAMES = 10
 _OVERSHOOT = 0.5
 
 
-class Failure(Exception):
-    """A phase that ended with a status of its own."""
-
-    def __init__(self, status: Status, reason: str) -> None:
-        super().__init__(reason)
-        self.status, self.reason = status, reason
-
-
 def main(request_path: str) -> int:
     """Carry out the request; always leaves an Outcome behind unless the process dies."""
     request = read_model(Path(request_path), Request)
     end_with_parent(request.harness)
-    phase: Callable[[Request, Method, TrainingScene], Outcome] = _fit if request.phase == "fit" else _render
+    phases: dict[str, Callable[[Request, Any, TrainingScene], Outcome]] = {
+        "fit": _fit,
+        "import": _import,
+        "render": _render,
+    }
+    phase = phases[request.phase]
     try:
-        method = load_method(request.method)
+        method: Method | Importer = load_importer(request.importer) if request.importer else load_method(request.method)
         outcome = phase(request, method, Scene.open(Path(request.scene)).training())
     except Failure as failure:
         outcome = Outcome(status=failure.status, reason=failure.reason)
@@ -108,6 +106,12 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
     )
 
 
+def _import(request: Request, importer: Importer, scene: TrainingScene) -> Outcome:
+    fitted = importer.read(Path(request.source), Path(request.export), scene)
+    fitted.save(Path(request.model))
+    return Outcome(peak_device_memory_bytes=_device_peak(), renderer=_renderers())
+
+
 def _reporter(stream: TextIO) -> Callable[[float, str], None]:
     def report(fraction: float, message: str) -> None:
         stream.write(f"{fraction:.4f} {' '.join(message.split())}\n")
@@ -116,7 +120,7 @@ def _reporter(stream: TextIO) -> Callable[[float, str], None]:
     return report
 
 
-def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
+def _render(request: Request, method: Method | Importer, scene: TrainingScene) -> Outcome:
     fitted = method.load(Path(request.model), scene)
     output = Path(request.output)
     views = [(camera, t) for camera in scene.test_cameras.values() for t in range(scene.n_frames)]
