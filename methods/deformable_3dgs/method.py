@@ -56,7 +56,7 @@ class Deformable3DGS(Method):
             with run.stage("start"):
                 static = static_points(scene, config.static_points, config.static, rng)
                 # One canonical set for all times: points of several frames would all be there in every one.
-                liquid = hull_points(scene, config.hull_points, rng, largest_only=True)
+                liquid = hull_points(scene, config.hull_points, largest_only=True)
                 start = joined(static, liquid)
             model = DeformableModel.from_start(
                 start, config.start_opacity, config.sh_degree, config.depth, config.width

@@ -17,13 +17,9 @@ from splashbench_methods.scaffold_gs.anchors import seed_anchors, sparse_anchors
 from splashbench_methods.scaffold_gs.plate import make_plate
 
 from splashbench.errors import SplashbenchError
-from splashbench.observe import signed_distance_fields
+from splashbench.observe.initial_points import initial_points
 from splashbench.scene import TrainingScene
 
-# Of the hull's grid, along its longest side.
-_HULL_CELLS = 96
-# Points come from this near below the hull's surface, in voxels: what lies deeper is not seen.
-_SKIN = 3.0
 _PLATE_SIDE = 800
 
 
@@ -60,43 +56,23 @@ def static_points(
     return Start(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
 
 
-def hull_points(scene: TrainingScene, count: int, rng: np.random.Generator, largest_only: bool = False) -> Start:
-    """Some `count` points below the surface of the liquid's hull, in the colours of the views.
+def hull_points(scene: TrainingScene, count: int, largest_only: bool = False) -> Start:
+    """Some `count` points on the surface of the liquid's hull, in the colours of the views; none without liquid.
 
-    They are spread evenly over the frames or, with `largest_only`, all of the frame in which there is most of it.
+    They are spread evenly over the frames or, with `largest_only`, all of the frame in which the views see most of it.
     """
-    parts: list[Start] = []
-    try:
-        fields = signed_distance_fields(scene, cells_longest_axis=_HULL_CELLS)
-    except SplashbenchError:
-        if any(scene.mask(name, t).any() for name in scene.train for t in range(scene.n_frames)):
-            raise
-        return _joined(parts)  # no liquid in any frame: the static scene is all there is
-    skins = [np.argwhere((phi < 0) & (phi > -_SKIN)) for phi in fields.phi]
-    frames = [int(np.argmax([len(skin) for skin in skins]))] if largest_only else range(scene.n_frames)
-    per_frame = -(-count // len(frames))
-    for t in frames:
-        skin = skins[t]
-        if len(skin) == 0:
-            continue
-        chosen = skin[rng.permutation(len(skin))[:per_frame]]
-        offsets = rng.uniform(-0.5, 0.5, chosen.shape)
-        positions = np.asarray(fields.origin + (chosen + offsets) * fields.voxel, np.float32)
-        parts.append(
-            Start(positions, seen_colors(scene, positions, t), _spacing(positions), np.full(len(positions), t))
-        )
-    return _joined(parts)
+    seen = [sum(int(scene.mask(name, t).sum()) for name in scene.train) for t in range(scene.n_frames)]
+    if not any(seen) or count < 1:
+        return _joined([])
+    frames = [int(np.argmax(seen))] if largest_only else range(scene.n_frames)
+    clouds = initial_points(scene, -(-count // len(frames))).liquid
+    return _joined([_cloud(clouds[t], t) for t in frames])
 
 
-def seen_colors(scene: TrainingScene, positions: NDArray[np.float32], t: int) -> NDArray[np.float32]:
-    """Median colours [N, 3] in [0, 1] of the pixels that show `positions` [N, 3] in the training views at `t`."""
-    seen = []
-    for name, camera in scene.cameras.items():
-        pixels, _ = camera.project(positions)
-        column = np.clip(np.nan_to_num(pixels[:, 0]), 0, camera.width - 1).astype(int)
-        row = np.clip(np.nan_to_num(pixels[:, 1]), 0, camera.height - 1).astype(int)
-        seen.append(scene.image(name, t)[row, column] / np.float32(255))
-    return np.asarray(np.median(seen, axis=0), np.float32)
+def _cloud(points: NDArray[np.float64], t: int) -> Start:
+    """The start of timestep `t` from `points` [n, 6], positions and colours."""
+    positions, colors = points[:, :3].astype(np.float32), points[:, 3:].astype(np.float32)
+    return Start(positions, colors, _spacing(positions), np.full(len(points), t))
 
 
 def _spacing(positions: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -58,7 +58,8 @@ class GuidedDensity:
             room = self._config.most - len(self._model.positions)
             patches = min(self._config.guided_patches, room // _PER_RAY)
             if patches > 0:
-                self._density.append(self._gaussians(*self._worst(), patches))
+                photograph, error, depths = self._worst()
+                self._density.append(self._gaussians(photograph, error, depths, patches))
 
     @torch.no_grad()
     def _worst(self) -> tuple[Photograph, NDArray[np.float32], NDArray[np.float32]]:
@@ -76,7 +77,7 @@ class GuidedDensity:
                 shown = depth[(depth > 0) & inside & (splats.opacities.numpy() > 0.05)].astype(np.float32)
                 best = float(error.mean()), photograph, error, shown
         assert best is not None
-        return best[1:]
+        return best[1], best[2], best[3]
 
     def _gaussians(
         self, photograph: Photograph, error: NDArray[np.float32], depths: NDArray[np.float32], patches: int

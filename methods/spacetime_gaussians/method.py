@@ -65,7 +65,7 @@ class SpacetimeGaussians(Method):
             torch.manual_seed(run.seed)
             with run.stage("start"):
                 static = static_points(scene, config.static_points, config.static, rng)
-                start = joined(static, hull_points(scene, config.hull_points, rng))
+                start = joined(static, hull_points(scene, config.hull_points))
             times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
             model = SpacetimeModel.from_start(start, self.full, config.start_opacity, config.hull_log_width, times)
             extent = camera_extent(scene)
