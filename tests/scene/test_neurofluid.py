@@ -42,6 +42,17 @@ def test_the_last_view_is_the_test_view_and_the_frames_are_those_of_all_views(wa
     assert describe_scene(scene)["truth_particles"] is True
 
 
+def test_any_folder_name_gives_a_scene_that_runs(watersphere_copy: Path, tmp_path: Path) -> None:
+    for name, known in (("Water Sphere (1)", "Water_Sphere_1_"), ("-x", "_x"), ("bowl_001", "bowl_001")):
+        folder = watersphere_copy.rename(tmp_path / name)
+        scene = Scene.open(folder)
+        assert scene.name == known
+        # Not the released scene of that name: neither its times nor its units.
+        assert (scene.times_source, scene.is_released) == ("neurofluid", False)
+        make_training_view(scene, tmp_path / f"view of {known}")
+        watersphere_copy = folder
+
+
 def test_times_gravity_and_scale_are_those_of_the_simulation(watersphere: Path) -> None:
     scene = Scene.open(watersphere)
     np.testing.assert_allclose(scene.times, np.arange(6) * 0.02)
