@@ -13,6 +13,7 @@ from pathlib import Path
 from splashbench.files import write_model
 from splashbench.scene import Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
+from splashbench.scene.layout import plain_name
 from splashbench.scene.source import RELEASED_FILES, ReleasedSource
 
 
@@ -47,7 +48,7 @@ def make_training_view(scene: Scene, directory: Path) -> Path:
 
 def _shown_meta(scene: Scene) -> SceneMeta:
     """What a method is told of `scene`: nothing of where it came from."""
-    meta = scene.meta or SceneMeta(name=scene.name, times=None)
+    meta = scene.meta or SceneMeta(name=plain_name(scene.name))
     if meta.container_mesh is not None:
         # Under a name of its own: made-up scenes keep it beside the truth, which a method is not shown.
         suffix = mesh_path(scene.directory, meta.container_mesh).suffix.lower()

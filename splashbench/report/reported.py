@@ -20,10 +20,7 @@ def reported_table(scene: str) -> tuple[str, list[list[str]]] | None:
     rows = [row for row in paper_rows() if row["scene_set"] == scene.lower()]
     if not rows:
         return None
-    title = (
-        f"As the paper reports it ({rows[0]['source']}, {rows[0]['hardware']}), by its own unpublished scorer and not "
-        "by this protocol:"
-    )
+    title = f"As the paper reports it ({rows[0]['source']}), by its own unpublished scorer and not by this protocol:"
     lines = [["Method", *(METRICS[name].label for name in _FIGURES)], ["---", *["---:"] * len(_FIGURES)]]
     for row in rows:
         values = (row[name] for name in _FIGURES)

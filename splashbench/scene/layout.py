@@ -137,6 +137,11 @@ class SceneMeta(BaseModel):
         return self
 
 
+def plain_name(text: str) -> str:
+    """`text`, such as a folder's name, as a name that `SceneMeta` takes: other characters become "_"."""
+    return re.sub(r"[^A-Za-z0-9_.-]+|^[.-]+", "_", text)[:100] or "_"
+
+
 def _check_times(what: str, times: list[float]) -> None:
     array = np.asarray(times, dtype=np.float64)
     if not (np.abs(array) <= LARGEST).all() or (np.diff(array) <= 0).any():

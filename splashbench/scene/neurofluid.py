@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.files import MAX_NPZ_BYTES, image_size, read_npz, read_rgba
 from splashbench.progress import track
-from splashbench.scene.layout import LARGEST, SceneMeta
+from splashbench.scene.layout import LARGEST, SceneMeta, plain_name
 from splashbench.scene.particles import Particles
 from splashbench.scene.source import META_FILE, RELEASED_FILES, Source
 from splashbench.scene.transforms import Frame, Transforms, intrinsics, read_transforms, shared_frames, world_to_camera
@@ -118,9 +118,8 @@ class NeuroFluidSource(Source):
 
     def _described(self) -> SceneMeta:
         """What is known of these scenes; a scene.json in the folder goes before it, field by field."""
-        name = re.sub(r"[^A-Za-z0-9_.-]+|^[.-]+", "_", self.directory.resolve().name)[:100]
         known = SceneMeta(
-            name=name or self.layout,
+            name=plain_name(self.directory.resolve().name),
             times=[(number - self._numbers[0]) * STEP_SECONDS for number in self._numbers],
             sizes=self.train.sizes | self.test.sizes,
             metres_per_unit=METRES_PER_UNIT,

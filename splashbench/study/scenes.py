@@ -20,6 +20,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
 from splashbench.scene import Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
+from splashbench.scene.layout import plain_name
 from splashbench.scene.source import ReleasedSource
 from splashbench.study.perturb import Perturbation, direction_of_loss, without_part
 from splashbench.study.spec import Variant
@@ -115,7 +116,7 @@ def _convert(scene: Scene, train: list[str], kept: list[str], directory: Path) -
         test=scene.test,
         n_frames=scene.n_frames,
         frames=((name, t, scene.image(name, t), scene.mask(name, t)) for name, t in pairs),
-        meta=_meta_of(scene.meta or SceneMeta(name=scene.name), kept),
+        meta=_meta_of(scene.meta or SceneMeta(name=plain_name(scene.name)), kept),
         initial_points=scene.initial_points(),
     )
     if scene.meta is not None and scene.meta.container_mesh is not None:
