@@ -284,6 +284,18 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return _read_pixels(Path(path), "RGB")
 
 
+def read_rgba(path: Path) -> NDArray[np.uint8]:
+    """Read an image file as sRGB and opacity, uint8 [H, W, 4]; one without an alpha channel is refused."""
+    from PIL import Image
+
+    path = Path(path)
+    image_size(path)
+    with Image.open(path, formats=_IMAGE_FORMATS) as image:
+        if "A" not in image.getbands():
+            raise SplashbenchError(f"{path} has no alpha channel (it is {image.mode}); restore the RGBA file")
+    return _read_pixels(path, "RGBA")
+
+
 def read_gray(path: Path) -> NDArray[np.uint8]:
     """Read an image file as grey uint8 [H, W] (masks are 0 and 255)."""
     return _read_pixels(Path(path), "L")

@@ -35,7 +35,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "scene",
         help="look a scene over, write it for other codes",
-        description="A scene is a folder in the released layout, with or without scene.json.",
+        description="A scene is a folder in the released layout, with or without scene.json, or one of NeuroFluid's.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -120,12 +120,15 @@ def _seeds(row: Row) -> str:
     return " ".join(str(run.seed) for run in row.runs)
 
 
-def write_leaderboard(sources: Sequence[Source], out: Path) -> list[Path]:
-    """Write leaderboard.csv and leaderboard.md into the folder `out`; returns their paths."""
+def write_leaderboard(sources: Sequence[Source], out: Path, with_paper: bool = False) -> list[Path]:
+    """Write leaderboard.csv and leaderboard.md into the folder `out`; returns their paths.
+
+    with_paper: below a scene's table in the Markdown, what the paper reports for that scene. The CSV never has it.
+    """
     from splashbench.report.markdown import to_markdown
 
     rows = leaderboard_rows(sources)
     paths = [Path(out, "leaderboard.csv"), Path(out, "leaderboard.md")]
-    for path, text in zip(paths, (to_csv(rows), to_markdown(rows, sources))):
+    for path, text in zip(paths, (to_csv(rows), to_markdown(rows, sources, with_paper))):
         write_text(path, text)
     return paths
