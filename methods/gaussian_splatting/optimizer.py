@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-_SHORT_LAST = 0.1
+_SHORT_LAST = 0.03
 
 
 @dataclass(frozen=True)

@@ -123,25 +123,27 @@ def _reporter(stream: TextIO) -> Callable[[float, str], None]:
 def _render(request: Request, method: Method | Importer, scene: TrainingScene) -> Outcome:
     fitted = method.load(Path(request.model), scene)
     output = Path(request.output)
-    views = [(camera, t) for camera in scene.test_cameras.values() for t in range(scene.n_frames)]
+    times = request.times or {name: scene.camera_times[name].tolist() for name in scene.test_cameras}
+    views = [(scene.test_cameras[name], t, time) for name, own in times.items() for t, time in enumerate(own)]
     counts = []
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         report = _reporter(stream)
-        for i, (camera, t) in enumerate(views):
+        for i, (camera, t, time) in enumerate(views):
             _reset_primitive_counter()
-            render = _checked(fitted.render(camera, _time(scene, camera, t)), camera, t)
+            render = _checked(fitted.render(camera, time), camera, t)
             counts.append(_primitive_count())
             write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
             if request.exr:
                 write_exr(output / "exr" / camera.name / f"{t:06d}.exr", render.rgb, render.alpha)
             report((i + 1) / len(views), "rendering the test views")
-    particles = fitted.particles()
+    # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
+    particles = fitted.particles() if request.times is None else None
     if particles is not None:
         if particles.n_frames != scene.n_frames:
             raise Failure(Status.INCOMPLETE, f"particles cover {particles.n_frames} of {scene.n_frames} timesteps")
         _check_finite(particles)
         particles.save(output / "particles.npz")
-    geometry = fitted.signed_distance()
+    geometry = fitted.signed_distance() if request.times is None else None
     if geometry is not None:
         _check_geometry(geometry, scene.n_frames)
         geometry.save(output / "geometry.npz")

@@ -16,6 +16,7 @@ class Request(BaseModel):
     """What a child process is to do: `phase` fit (scene -> model), import (somebody's output -> model), render (model
     -> test views).
 
+    times: of the views to render, seconds by test camera; by default those of the scene's timesteps.
     importer: whose models are imported and rendered, instead of the method's; source, export: what it reads them from.
     """
 
@@ -38,6 +39,7 @@ class Request(BaseModel):
     timing_frames: int
     exr: bool
     cache: str | None = None
+    times: dict[str, list[float]] | None = None
     importer: str | None = None
     source: str = ""
     export: str = ""

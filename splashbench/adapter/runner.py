@@ -24,6 +24,7 @@ from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import atomic_directory, read_model, tree_bytes, write_model
 from splashbench.scene import Particles, Scene
 from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
+from splashbench.submission.withheld import Withheld, kept_timesteps
 from splashbench.version import __version__
 
 #: Protocol v1: the frame rate is the median of at least this many renders.
@@ -45,6 +46,7 @@ def run_method(
     keep_model: bool = True,
     exr: bool = False,
     cache: Path | None = None,
+    withheld: Withheld | None = None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
 
@@ -56,16 +58,19 @@ def run_method(
         keep_model: keep the fitted model under OUT/model, so that it can be rendered again.
         exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
         cache: a folder for what the runs of one study share (adapter/reuse.py); the record says what came from there.
+        withheld: timesteps that the method does not see; they are rendered and scored (submission/withheld.py).
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
     """
     scene = Scene.open(scene_directory)
+    if withheld and scene.n_frames < 3:
+        raise SplashbenchError(f"{scene_directory} has {scene.n_frames} timesteps; to withhold some takes three")
     if name == EXTERNAL:
         raise SplashbenchError(
             "`external` is run by commands: splashbench run external SCENE OUT --name ... --command ..."
         )
     if name == ORACLE:
-        if preset or overrides:
+        if preset or overrides or withheld:
             raise SplashbenchError("the oracle is the truth itself, without presets or settings; leave them out")
         from splashbench.adapter.oracle import write_oracle
 
@@ -84,6 +89,7 @@ def run_method(
         device=device,
         scene=scene.name,
         scene_digest=scene.digest,
+        withheld=withheld,
     )
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene_directory]) as staging,
@@ -96,7 +102,7 @@ def run_method(
                 phase="fit",
                 harness=os.getpid(),
                 method=name,
-                scene=str(make_training_view(scene, Path(scratch, "scene"))),
+                scene=str(make_training_view(scene, Path(scratch, "scene"), kept_timesteps(scene.n_frames, withheld))),
                 preset=preset,
                 overrides=dict(overrides or {}),
                 seed=seed,
@@ -110,6 +116,7 @@ def run_method(
                 timing_frames=timing_frames,
                 exr=exr,
                 cache=str(cache.resolve()) if cache else None,
+                times={name: scene.camera_times[name].tolist() for name in scene.test} if withheld else None,
             ),
         )
         drop_unwanted(staging, record.status, keep_model)

@@ -52,6 +52,11 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         metavar="N",
         help="frames timed for FPS (default 100; of fewer it is not scored)",
     )
+    parser.add_argument(
+        "--withhold",
+        choices=["odd"],
+        help="keep every second timestep from the method; these are rendered, and they alone are scored",
+    )
     parser.add_argument("--exr", action="store_true", help="write the renders also as OpenEXR, for compositing")
     parser.add_argument("--no-model", action="store_true", help="do not keep the fitted model under OUT/model")
     parser.add_argument("--replace", action="store_true", help="replace OUT when it exists")
@@ -112,6 +117,7 @@ def _run_method(arguments: argparse.Namespace) -> Submission:
         timeout_seconds=arguments.timeout,
         timing_frames=TIMING_FRAMES if arguments.timing_frames is None else arguments.timing_frames,
         exr=arguments.exr,
+        withheld=arguments.withhold,
         keep_model=not arguments.no_model,
         replace=arguments.replace,
     )

@@ -73,13 +73,13 @@ def leaderboard_rows(sources: Sequence[Source]) -> list[Row]:
 
 def table_of(row: Row) -> tuple[str, str, str]:
     """What rows must share to stand in one table: scene, its exact bytes, and protocol."""
-    return (row.first.scene, row.first.digests.scene, row.first.protocol.label)
+    return (row.first.scene, row.first.digests.scene, row.first.protocol_label)
 
 
 def _identity(result: Result) -> tuple:
     """What runs must share to be one row; failed runs never share one."""
     return (
-        (result.scene, result.digests.scene, result.protocol.label),
+        (result.scene, result.digests.scene, result.protocol_label),
         (result.method, result.preset, settings_digest(result), hardware_label(result.hardware)),
         "" if result.status == "ok" else result.digests.submission,
     )
@@ -107,7 +107,7 @@ def to_csv(rows: Sequence[Row]) -> str:
                 *(format_value(name, row.value(name)) for name in _FIGURES),
                 *(str(run.control).lower(), str(run.mixed).lower(), len(row.runs)),
                 *(format_value(name, row.spread(name)) for name in _SPREAD),
-                *(run.method_version, settings_digest(run), run.protocol.label, run.digests.scene),
+                *(run.method_version, settings_digest(run), run.protocol_label, run.digests.scene),
                 hardware_label(run.hardware),
                 *(format_value(name, row.value(name)) for name in TRUTH_METRICS),
                 *(format_value(name, row.spread(name)) for name in TRUTH_METRICS),

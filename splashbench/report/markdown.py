@@ -127,8 +127,8 @@ def _cost_cell(row: Row, name: str) -> str:
 def _means(rows: Sequence[Row], letters: dict[str, str]) -> list[str]:
     """Means over scenes, of methods that have a score on every scene: a mean over the easy ones would flatter."""
     parts = []
-    for protocol in sorted({row.first.protocol.label for row in rows}):
-        members = [row for row in rows if row.first.protocol.label == protocol]
+    for protocol in sorted({row.first.protocol_label for row in rows}):
+        members = [row for row in rows if row.first.protocol_label == protocol]
         scenes = {row.first.digests.scene for row in members}
         if len(scenes) > 1:
             parts += [

@@ -81,6 +81,7 @@ def score_submission(
         settings=identity.settings,
         control=identity.control,
         mixed=identity.mixed,
+        withheld=identity.withheld,
         status=status,
         reason=submission.reason,
         protocol=protocol,

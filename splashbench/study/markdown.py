@@ -134,6 +134,8 @@ def _variants(table: Table) -> str:
         if variant.train_views is not None:
             views = dict.fromkeys(" ".join(run.entry.train_views) for run in row.runs if run.entry)
             changed.append(f"training views {' / '.join(view for view in views if view) or variant.train_views}")
+        if variant.withheld:
+            changed.append(f"{variant.withheld} timesteps withheld")
         said = ", ".join(f"{key} = {value}" for key, value in settings.items())
         lines.append([_title(row), method + first.preset, said or NONE, ", ".join(changed) or NONE, row.note or NONE])
     return _joined(lines)

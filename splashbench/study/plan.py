@@ -180,4 +180,6 @@ def _digest(
         "scene": [scene.digest, changes(scene, variant, seed)],
         "protocol": PROTOCOL_V1.digest,
     }
+    if variant.withheld:  # said only where it is so: the digests of other runs stay
+        said["withheld"] = variant.withheld
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

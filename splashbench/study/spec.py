@@ -18,6 +18,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import validate_model
 from splashbench.score.metrics import METRICS, Metric
 from splashbench.study.perturb import Perturbation
+from splashbench.submission.withheld import Withheld
 
 #: Metrics that follow from others, tabulated here alone: sigma_D over mu_D is what the paper's Table S7 gives.
 DERIVED: dict[str, tuple[Metric, str, str]] = {
@@ -47,6 +48,7 @@ class Variant(_Model):
     method: another one than the study's, with its own preset (the first, unless named) and settings; `base` is not its.
 
     train_views: a number (nested subsets that bracket the test views) or the names of the training views kept.
+    withheld: timesteps that the method does not see, and that alone are scored (submission/withheld.py).
     """
 
     name: str = Field(pattern=_NAME)
@@ -56,6 +58,7 @@ class Variant(_Model):
     settings: dict[str, Any] = Field(default_factory=dict)
     perturbation: tuple[Perturbation, ...] = ()
     train_views: Annotated[int, Field(ge=2)] | tuple[str, ...] | None = None
+    withheld: Withheld | None = None
     paper: str | None = None
 
 
