@@ -22,7 +22,10 @@ class Settings(SplattingSettings):
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "quick": {"iterations": 700, "most": 14_000, "rate_factor": 4.0, "color_factor": 4.0},
+        "quick": {
+            "iterations": 700, "views_per_step": 2, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
+            "color_factor": 4.0, "network_factor": 2.0,
+        },
         "paper": {
             "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "depth": 8, "width": 256, "sh_degree": 3,
             "sh_every": 1000, "static": "points", "static_points": 100_000, "hull_points": 100_000,
@@ -31,7 +34,7 @@ class Settings(SplattingSettings):
         },
     }  # fmt: skip
 
-    warm_up: float = Field(default=0.05, ge=0, le=1)
+    warm_up: float = Field(default=0.1, ge=0, le=1)
     time_noise: float = Field(default=0.1, ge=0, le=10)
     time_noise_until: float = Field(default=0.5, gt=0, le=1)
     depth: int = Field(default=8, ge=2, le=32)

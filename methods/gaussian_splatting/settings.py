@@ -28,7 +28,7 @@ class SplattingSettings(MethodConfig):
         reset_every: steps between opacity resets, 0 for never; reset_until: share after which there are none.
         rate_factor: times the published learning rates of where Gaussians are and how they move.
         color_factor: times the published learning rates of colours and features.
-        rates: whether every learning rate falls to a tenth ("short"), or as published.
+        rates: whether every learning rate falls to a hundredth ("short"), or as published.
         longest_side: photographs are shrunk to this many pixels.
     """
 
@@ -40,10 +40,10 @@ class SplattingSettings(MethodConfig):
     start_opacity: float = Field(default=0.6, gt=0, lt=1)
     most: int = Field(default=20_000, ge=10, le=10_000_000)
     grow_from: float = Field(default=0.1, ge=0, le=1)
-    grow_until: float = Field(default=0.6, ge=0, le=1)
+    grow_until: float = Field(default=0.5, ge=0, le=1)
     grow_every: int = Field(default=100, ge=1)
     grow_gradient: float = Field(default=2e-4, gt=0)
-    prune_until: float = Field(default=0.6, ge=0, le=1)
+    prune_until: float = Field(default=0.5, ge=0, le=1)
     reset_every: int = Field(default=0, ge=0)
     reset_until: float = Field(default=0.6, ge=0, le=1)
     rate_factor: float = Field(default=1.0, gt=0, le=1000)

@@ -19,7 +19,9 @@ class Settings(SplattingSettings):
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "quick": {"hull_points": 20_000, "most": 40_000, "rate_factor": 4.0, "color_factor": 4.0},
+        "quick": {
+            "iterations": 600, "hull_points": 20_000, "most": 30_000, "rate_factor": 4.0, "color_factor": 4.0,
+        },
         "paper": {
             "iterations": 30_000, "views_per_step": 2, "static": "points", "static_points": 100_000,
             "hull_points": 200_000, "start_opacity": 0.1, "most": 1_000_000, "grow_from": 0.02, "grow_until": 0.06,
