@@ -28,12 +28,19 @@ class Watched:
 
 
 def run_watched(
-    arguments: list[str], *, log: Path, progress: Path, label: str, timeout_seconds: float | None
+    arguments: list[str],
+    *,
+    log: Path,
+    progress: Path,
+    label: str,
+    timeout_seconds: float | None,
+    keep_bar: bool = True,
 ) -> Watched:
     """Run `python ARGUMENTS` in a process group of its own until it ends or its time is up.
 
-    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar.
-    Memory is the sum of resident sizes over the process tree, sampled every 50 ms.
+    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, which
+    stays on the terminal with `keep_bar`. Memory is the sum of resident sizes over the process tree, sampled every
+    50 ms.
     """
     environment = dict(os.environ)
     # Idle OpenMP threads that spin steal the renderer's cores (research: twice the time on two cores).
@@ -48,7 +55,7 @@ def run_watched(
             env=environment,
         )
     start, peak, timed_out = time.monotonic(), 0, False
-    bar = Bar(label)
+    bar = Bar(label, keep_bar)
     reader = _ProgressReader(progress)
     try:
         while process.poll() is None:

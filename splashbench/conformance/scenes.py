@@ -12,7 +12,6 @@ import numpy as np
 from splashbench.adapter.training_view import make_training_view
 from splashbench.files import read_json, sha256_file, write_json, write_model, write_png
 from splashbench.scene import Scene
-from splashbench.synth.balls import write_balls_scene
 
 #: In place of every file that a method is not shown. It opens, so that whoever opens it is noticed.
 _BAIT = b"This is a test view, which no method may read.\n"
@@ -40,11 +39,8 @@ class Place:
         return found
 
 
-def make_scene(source: Path | None, parent: Path) -> Path:
-    """A copy in `parent` of the scene `source`, or the small made-up scene of balls."""
-    if source is None:
-        write_balls_scene(parent / "balls")
-        return parent / "balls"
+def copy_scene(source: Path, parent: Path) -> Path:
+    """A copy of the scene `source` in the folder `parent`."""
     # The folder keeps its name: without scene.json it decides what a scene is (Table S1).
     return Path(shutil.copytree(source, parent / source.resolve().name))
 

@@ -68,7 +68,7 @@ def stop_run(
             env=environment,
             start_new_session=True,
         )
-    bar, start = Bar(label), time.monotonic()
+    bar, start = Bar(label, keep=False), time.monotonic()
     try:
         while process.poll() is None and not flag.exists() and time.monotonic() - start < timeout_seconds:
             time.sleep(_POLL_SECONDS)

@@ -28,6 +28,7 @@ from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import read_model, write_model
 from splashbench.scene import Scene
 from splashbench.submission import Status, check_submission
+from splashbench.synth.balls import write_balls_scene
 
 SEED, OTHER_SEED = 0, 1
 #: Allowed to a process for starting, on top of half a fit, before its time limit is up.
@@ -88,17 +89,23 @@ class Trial:
         self._mark = uuid.uuid4().hex
         self._count = 0
         if scene is not None:
-            Scene.open(scene)
+            _ = Scene.open(scene).digest  # whatever is missing is told by the name that the user knows
+
+    @cached_property
+    def small(self) -> Path:
+        """The made-up scene of balls."""
+        write_balls_scene(self._work / "small" / "balls")
+        return self._work / "small" / "balls"
 
     @cached_property
     def ordinary(self) -> scenes.Place:
         """The scene as it is."""
-        return scenes.ordinary(scenes.make_scene(self._source, self._folder("scene")), self._folder("scene"))
+        return scenes.ordinary(self._copy(self._source or self.small, "scene"), self._folder("scene"))
 
     @cached_property
     def hidden(self) -> scenes.Place:
         """The scene with test views and truth made unreadable."""
-        return scenes.hidden(scenes.make_scene(self._source, self._folder("hidden")), self._folder("hidden"))
+        return scenes.hidden(self._copy(self._source or self.small, "hidden"), self._folder("hidden"))
 
     @cached_property
     def before(self) -> dict[str, str]:
@@ -181,14 +188,14 @@ class Trial:
     @cached_property
     def one_frame(self) -> Answer:
         """A fit of a small scene of one timestep."""
-        scene = scenes.make_scene(None, self._folder("one_frame"))
+        scene = self._copy(self.small, "one_frame")
         scenes.keep_first_frame(scene)
         return self._child("fit", scenes.ordinary(scene, scene.parent), self._model("one_frame"))
 
     @cached_property
     def no_liquid(self) -> Answer:
         """A fit of a small scene whose masks are all empty."""
-        scene = scenes.make_scene(None, self._folder("no_liquid"))
+        scene = self._copy(self.small, "no_liquid")
         scenes.empty_masks(scene)
         return self._child("fit", scenes.ordinary(scene, scene.parent), self._model("no_liquid"))
 
@@ -253,6 +260,7 @@ class Trial:
                 progress=work / "progress",
                 label=f"{self.method.id}: {do}",
                 timeout_seconds=self.timeout_seconds,
+                keep_bar=False,
             )
         self.touches |= dict.fromkeys(read_touched(work / "touched"))
         self.opened |= dict.fromkeys(opening.seen)
@@ -291,6 +299,9 @@ class Trial:
         folder = self._work / name
         folder.mkdir(parents=True, exist_ok=True)
         return folder
+
+    def _copy(self, scene: Path, name: str) -> Path:
+        return scenes.copy_scene(scene, self._folder(name))
 
     def _model(self, name: str) -> Path:
         return self._folder(f"models/{name}")

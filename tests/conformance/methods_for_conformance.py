@@ -1,6 +1,7 @@
 """A method that keeps the contract, and methods that each break one of its clauses; given as FILE.py:CLASS."""
 
 import json
+import os
 import pickle
 import subprocess
 import time as clock
@@ -226,7 +227,7 @@ class FewParticles(Sky):
         return Model(mean, phase, scene.n_frames - 1)
 
 
-class PhiOfOneFrame(Sky):
+class PhiAsAnArray(Sky):
     class Model(Model):
         def signed_distance(self) -> None:
             return np.zeros((4, 4, 4))  # type: ignore[return-value]
@@ -319,6 +320,18 @@ class Litters(Sky):
     def step(self, scene: TrainingScene, config: Settings, run: Run, step: int) -> None:
         super().step(scene, config, run, step)
         Path(config.place).write_text("mine")
+
+
+class LittersFromAFork(Litters):
+    """The file is written by a process that the method forks."""
+
+    def step(self, scene: TrainingScene, config: Settings, run: Run, step: int) -> None:
+        Sky.step(self, scene, config, run, step)
+        child = os.fork()
+        if child == 0:
+            Path(config.place).write_text("mine")
+            os._exit(0)
+        os.waitpid(child, 0)
 
 
 class Scribbles(Sky):

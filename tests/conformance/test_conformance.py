@@ -9,7 +9,7 @@ from splashbench.conformance import Report, Verdict, conform
 from splashbench.errors import SplashbenchError
 
 METHODS = Path(__file__).with_name("methods_for_conformance.py")
-RENDERING = ["files", "load", "again", "views", "between", "size", "principal_point", "particles", "signed_distance"]
+RENDERING = ["files", "load", "again", "views", "between", "size", "principal_point"]
 SCENE = ["same_seed", "hidden_test_views", "unread_test_views", "unchanged_scene", "writes"]
 
 
@@ -70,8 +70,6 @@ def test_progress_that_tells_nothing(name: str, said: str) -> None:
         ("Centred", {"principal_point": "shows the part around the middle of the image"}),
         ("FramesOnly", {"between": "render() raised ValueError"}),
         ("NotANumber", dict.fromkeys(["views", "between", "size", "principal_point"], "has NaN or infinite pixels")),
-        ("FewParticles", {"particles": "particles cover 7 of 8 timesteps"}),
-        ("PhiOfOneFrame", {"signed_distance": "returned ndarray, not a SignedDistance"}),
     ],
 )
 def test_models_that_are_not_what_they_seem(name: str, failed: dict[str, str]) -> None:
@@ -110,13 +108,27 @@ def test_fits_that_use_what_they_may_not(name: str, only: list[str], failed: dic
     assert set(verdicts(report, Verdict.NOT_TESTED)) == undecided
 
 
+@pytest.mark.parametrize(
+    ("name", "failed", "said"),
+    [
+        ("FewParticles", "particles", "particles cover 7 of 8 timesteps"),
+        ("PhiAsAnArray", "signed_distance", "returned ndarray, not a SignedDistance"),
+    ],
+)
+def test_geometry_that_is_not_whole(name: str, failed: str, said: str) -> None:
+    found = verdicts(tried(name, ["views", "particles", "signed_distance"]), Verdict.FAILED)
+    assert set(found) == {failed}
+    assert said in found[failed]
+
+
 def test_a_seed_that_is_refused() -> None:
     assert "KeyError" in verdicts(tried("OneSeed", ["other_seed"]), Verdict.FAILED)["other_seed"]
 
 
-def test_a_file_written_elsewhere_is_a_warning(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["Litters", "LittersFromAFork"])
+def test_a_file_written_elsewhere_is_a_warning(tmp_path: Path, name: str) -> None:
     place = tmp_path / "notes"
-    report = tried("Litters", ["writes", "unchanged_scene"], overrides={"place": str(place)})
+    report = tried(name, ["writes"], overrides={"place": str(place)})
     assert verdicts(report, Verdict.WARNING) == {"writes": f"it writes {place}"}
     assert report.passed
 
@@ -170,6 +182,12 @@ def test_a_scene_of_the_users_is_copied_and_left_alone(balls_copy: Path) -> None
     assert before == {
         path: (path.read_bytes(), path.stat().st_mtime_ns) for path in balls_copy.rglob("*") if path.is_file()
     }
+
+
+def test_a_damaged_scene_is_told_by_its_own_name(balls_copy: Path) -> None:
+    (balls_copy / "ims" / "1" / "000003.png").unlink()
+    with pytest.raises(SplashbenchError, match=f"{balls_copy}/ims/1/000003.png is missing"):
+        tried("Sky", ["fit"], scene=balls_copy)
 
 
 def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
