@@ -62,7 +62,7 @@ def _shown(view: Path) -> set[str]:
 
 def _carry_out(order: Order, answer: Answer, reporter: _Reporter) -> None:
     answer.stage = "import"
-    method = load_method(order.method)
+    method = load_method(order.subject.method)
     scene = Scene.open(Path(order.view)).training()
     views = views_of(scene)
     if order.do == "fit":
@@ -76,13 +76,14 @@ def _carry_out(order: Order, answer: Answer, reporter: _Reporter) -> None:
         answer.stage = "fit"
         run = Run(
             seed=order.seed,
-            device=order.device,
+            device=order.subject.device,
             directory=Path(order.scratch),
-            budget_seconds=order.budget_seconds,
+            budget_seconds=order.subject.timeout_seconds,
             _report=reporter,
         )
+        config = method.Config.preset(order.subject.preset, order.subject.overrides)
         start = time.perf_counter()
-        fitted = method.fit(scene, method.Config.preset(order.preset, order.overrides), run)
+        fitted = method.fit(scene, config, run)
         answer.fit_seconds = time.perf_counter() - start
     else:
         answer.stage = "load"

@@ -16,6 +16,19 @@ class Verdict(str, Enum):
     NOT_TESTED = "not_tested"
 
 
+#: A verdict, and what was found.
+Found = tuple[Verdict, str]
+_SHOWN = 3
+
+
+def found(faults: list[str], ok: str = "", wrong: Verdict = Verdict.FAILED) -> Found:
+    """`wrong` with the first of `faults`, or, where there is none, ok with the text `ok`."""
+    if not faults:
+        return Verdict.OK, ok
+    more = f" (and {len(faults) - _SHOWN} more)" if len(faults) > _SHOWN else ""
+    return wrong, "; ".join(faults[:_SHOWN]) + more
+
+
 class NotTested(Exception):
     """A check cannot be made; the text says why."""
 

@@ -10,18 +10,26 @@ from pydantic import BaseModel, ConfigDict, Field
 Kind = Literal["test", "between", "size", "window"]
 
 
-class Order(BaseModel):
-    """What a child process is to do: fit, render and save; or load and render. Paths are absolute."""
+class Subject(BaseModel):
+    """The method under test, with what settings and limits."""
 
     model_config = ConfigDict(extra="forbid")
-    do: Literal["fit", "load"]
-    harness: int
+    id: str
     method: str
     preset: str
     overrides: dict[str, Any]
-    seed: int
     device: str
-    budget_seconds: float | None
+    timeout_seconds: float
+
+
+class Order(BaseModel):
+    """What a child process is to do: fit, save and render; or load and render. Paths are absolute."""
+
+    model_config = ConfigDict(extra="forbid")
+    do: Literal["fit", "load"]
+    subject: Subject
+    seed: int
+    harness: int  # the process that waits for the child, and without which the child must not go on
     view: str  # the training view that the method is given
     scene: str  # the scene that it is a view of
     model: str

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from splashbench.adapter.runner import parse_overrides
-from splashbench.conformance.checks import _signal_faults
 from splashbench.conformance.opening import Opening
 from splashbench.conformance.scenes import empty_masks, hidden, keep_first_frame
+from splashbench.conformance.stop_checks import signal_faults
 from splashbench.conformance.stopping import Stopped, as_pairs
 from splashbench.conformance.stored import storage_faults
 from splashbench.scene import Scene
@@ -107,15 +107,15 @@ def test_scenes_at_the_edge(balls_copy: Path, balls: Scene) -> None:
 def test_what_a_stopped_run_must_not_leave(tmp_path: Path) -> None:
     out = tmp_path / "submission"
     good = Stopped(held=True, exit_code=143, said="interrupted", seconds=0.1)
-    assert _signal_faults(good, signal.SIGTERM, out) == []
-    assert _signal_faults(good, signal.SIGINT, out) == ["exit status 143: interrupted"]
-    assert _signal_faults(Stopped(True, None, "", 20.0), signal.SIGINT, out) == ["the run did not end"]
+    assert signal_faults(good, signal.SIGTERM, out) == []
+    assert signal_faults(good, signal.SIGINT, out) == ["exit status 143: interrupted"]
+    assert signal_faults(Stopped(True, None, "", 20.0), signal.SIGINT, out) == ["the run did not end"]
     early = Stopped(held=False, exit_code=0, said="ok", seconds=0.1)
-    assert _signal_faults(early, signal.SIGTERM, out) == ["the fit did not get to its middle: ok"]
+    assert signal_faults(early, signal.SIGTERM, out) == ["the fit did not get to its middle: ok"]
     (tmp_path / ".tmp-12345678-submission").mkdir()
-    assert _signal_faults(good, signal.SIGTERM, out) == [".tmp-12345678-submission was left beside the submission"]
+    assert signal_faults(good, signal.SIGTERM, out) == [".tmp-12345678-submission was left beside the submission"]
     out.mkdir()
-    assert "there is a submission" in _signal_faults(good, signal.SIGTERM, out)
+    assert "there is a submission" in signal_faults(good, signal.SIGTERM, out)
 
 
 def test_settings_go_through_the_command_line_unchanged() -> None:
