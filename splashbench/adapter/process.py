@@ -37,10 +37,23 @@ class Watched:
 
 
 def run_watched(
-    arguments: list[str], *, log: Path, progress: Path, label: str, timeout_seconds: float | None
+    arguments: list[str],
+    *,
+    log: Path,
+    progress: Path,
+    label: str,
+    timeout_seconds: float | None,
+    keep_bar: bool = True,
 ) -> Watched:
     """Run `python ARGUMENTS`; see `watch`."""
-    return watch([sys.executable, *arguments], log=log, progress=progress, label=label, timeout_seconds=timeout_seconds)
+    return watch(
+        [sys.executable, *arguments],
+        log=log,
+        progress=progress,
+        label=label,
+        timeout_seconds=timeout_seconds,
+        keep_bar=keep_bar,
+    )
 
 
 def watch(
@@ -51,12 +64,13 @@ def watch(
     label: str,
     timeout_seconds: float | None,
     tell_log: bool = False,
+    keep_bar: bool = True,
 ) -> Watched:
     """Run `command` in a process group of its own until it ends or its time is up.
 
-    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, and with
-    `tell_log` the log's last line is shown where there are none. Memory is the sum of resident sizes over the process
-    tree, and the time that the process took is known, to 50 ms.
+    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, which stays
+    on the terminal with `keep_bar`, and with `tell_log` the log's last line is shown where there are none. Memory is
+    the sum of resident sizes over the process tree, and the time that the process took is known, to 50 ms.
     """
     environment = dict(os.environ)
     environment[_MARK] = mark = uuid.uuid4().hex
@@ -72,7 +86,7 @@ def watch(
             env=environment,
         )
     start, peak, timed_out = time.monotonic(), 0, False
-    bar = Bar(label)
+    bar = Bar(label, keep_bar)
     reader = _ProgressReader(progress)
     told, fraction = start, 0.0
     try:
