@@ -12,6 +12,9 @@ SETTINGS: dict[str, dict[str, object]] = {
     "nearest_camera": {},
     "nothing": {"iterations": 20, "anchors": 300},
     "scaffold_gs": {"iterations": 20, "anchors": 300},
+    "deformable_3dgs": {"iterations": 12, "static_points": 300, "hull_points": 200, "width": 16, "depth": 4},
+    "spacetime_gaussians": {"iterations": 12, "static_points": 300, "hull_points": 200},
+    "spacetime_gaussians_lite": {"iterations": 12, "static_points": 300, "hull_points": 200},
     "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
 }
 # A dozen starts of PyTorch, three of them to be stopped, are for `make test-all`.
@@ -39,6 +42,6 @@ def test_controls_keep_the_contract(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nearest_camera", "nothing", "scaffold_gs", "splashsplat"])
+@pytest.mark.parametrize("name", sorted(set(SETTINGS) - {"hull_points"}))
 def test_every_method_keeps_all_of_the_contract(name: str) -> None:
     assert faults(conform(name, overrides=SETTINGS[name])) == {}
