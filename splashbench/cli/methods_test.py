@@ -39,7 +39,7 @@ def register(actions: argparse._SubParsersAction) -> None:
     parser.add_argument("--preset", help="default: `quick` where the method has it, else its first one")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
     parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can")
-    parser.add_argument("--only", nargs="+", metavar="CHECK", help="make these checks alone")
+    parser.add_argument("--only", nargs="+", action="extend", metavar="CHECK", help="make these checks alone")
     parser.add_argument(
         "--timeout", type=seconds_above_zero, metavar="SECONDS", help="limit of each single step (default 600)"
     )
