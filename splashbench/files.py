@@ -43,6 +43,13 @@ def _sibling(path: Path) -> Path:
     return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{path.name}")
 
 
+def is_staged_for(path: Path, output: Path) -> bool:
+    """Whether `path` has the place and name of a staging folder for `output`: what a killed process may leave."""
+    output = Path(output).resolve()
+    staged = _STAGED.match(path.name)
+    return path.parent == output.parent and staged is not None and path.name[staged.end() :] == output.name
+
+
 def as_asked(path: Path | str) -> str:
     """`path` under the name the user knows, not that of its staging place."""
     return _STAGED.sub("", str(path))
@@ -275,6 +282,18 @@ def _read_pixels(path: Path, mode: str) -> NDArray[np.uint8]:
 def read_image(path: Path) -> NDArray[np.uint8]:
     """Read an image file as sRGB uint8 [H, W, 3]; transparency is dropped."""
     return _read_pixels(Path(path), "RGB")
+
+
+def read_rgba(path: Path) -> NDArray[np.uint8]:
+    """Read an image file as sRGB and opacity, uint8 [H, W, 4]; one without an alpha channel is refused."""
+    from PIL import Image
+
+    path = Path(path)
+    image_size(path)
+    with Image.open(path, formats=_IMAGE_FORMATS) as image:
+        if "A" not in image.getbands():
+            raise SplashbenchError(f"{path} has no alpha channel (it is {image.mode}); restore the RGBA file")
+    return _read_pixels(path, "RGBA")
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from splashbench_methods.gaussian_splatting.losses import l1
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed
 from splashbench_methods.scaffold_gs.growth import Growth
-from splashbench_methods.scaffold_gs.losses import l1
 from splashbench_methods.scaffold_gs.model import PER_ANCHOR, AnchorModel, Variant
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 from splashbench_methods.scaffold_gs.plate import Plate, shrunk
@@ -98,7 +98,7 @@ def fit_model(
             gaussians = model.decode(plate.camera.center)
             means, factors, opacities, colors, scales = gaussians
             image, _ = rasterize(means, factors, opacities, colors, plate.camera, background=behind)
-            loss = (1 - _SSIM_WEIGHT) * l1(image, plate)
+            loss = (1 - _SSIM_WEIGHT) * l1(image, plate.image, plate.seen)
             if iteration % settings.ssim_every == 0:
                 loss = loss + settings.ssim_every * _SSIM_WEIGHT * (1 - ssim(image, views.structure(view)))
             drawn = opacities.detach() > 0

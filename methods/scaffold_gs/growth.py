@@ -4,16 +4,6 @@ Growing: a voxel becomes an anchor where a Gaussian within it has a mean gradien
 tau_g and there is no anchor yet, at three levels: level m = 0, 1, 2 has voxels of 16, 4 and 1 times the finest size and
 the threshold 2^m tau_g. A random share of the candidates is left out. Pruning: an anchor goes if its Gaussians'
 opacities, averaged over the steps, add up to almost nothing.
-
-The renderer gives the gradient g by the mean in space. With h = R g, R the camera's rotation, and a mean at depth z,
-the gradient by its projection (u, v) is
-
-    dL/du = h_x z / fx,    dL/dv = h_y z / fy:
-
-moving the mean parallel to the image moves its projection by f / z and leaves its footprint alone, but for the small
-terms off the optical axis, so these two components hold dL/d(u, v) without the footprint's share, which lies in h_z.
-(The projection's pseudo-inverse would mix h_z in.) Gradients are taken in normalised device coordinates, W/2 and H/2
-pixels a unit, in which the published thresholds are given.
 """
 
 from __future__ import annotations
@@ -21,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from splashbench_methods.gaussian_splatting.screen import screen_gradients
 from splashbench_methods.scaffold_gs.model import FEATURES, AnchorModel, Gaussians, random_offsets
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
@@ -33,17 +24,6 @@ _KEPT_CANDIDATES = 0.5
 # Visits before a mean counts, as shares of the steps between two rounds.
 _GROW_VISITS, _PRUNE_VISITS = 0.4, 0.8
 _CELL_LIMIT = 1 << 20
-
-
-def screen_gradients(camera: Camera, means: NDArray, gradients: NDArray) -> NDArray[np.float32]:
-    """Norms [N] of the gradients by the projected means, in normalised device coordinates.
-
-    means, gradients: [N, 3], of a loss by them. Gaussians that were not drawn have none; neither do they get one here.
-    """
-    local = gradients @ camera.w2c[:3, :3].T.astype(np.float32)
-    depth = means @ camera.w2c[2, :3].astype(np.float32) + np.float32(camera.w2c[2, 3])
-    half = np.array([camera.width / 2 / camera.K[0, 0], camera.height / 2 / camera.K[1, 1]], np.float32)
-    return np.asarray(np.linalg.norm(local[:, :2] * half, axis=1) * np.abs(depth), dtype=np.float32)
 
 
 class Growth:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from splashbench_methods.gaussian_splatting.splats import rotation_matrices
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed
 from torch import nn
 
@@ -126,17 +127,6 @@ class AnchorModel(nn.Module):
 def random_offsets(n: int, children: int) -> torch.Tensor:
     """Offsets [n, children, 3] of new anchors, from torch's generator; within the anchor's cell."""
     return torch.rand(n, children, 3) * 1.4 - 0.7
-
-
-def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:
-    """Rotations [N, 3, 3] of quaternions [N, 4] (w x y z), normalised here."""
-    w, x, y, z = nn.functional.normalize(quaternions, dim=1).unbind(1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
 
 
 def to_arrays(model: AnchorModel) -> dict[str, np.ndarray]:

@@ -15,8 +15,9 @@ from typing import Any, TextIO
 
 from splashbench.adapter.contract import Fitted, Method, Run
 from splashbench.adapter.discovery import load_method
-from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
-from splashbench.adapter.returned import Failure, check_geometry, check_particles, checked_render
+from splashbench.adapter.importers import Importer, load_importer
+from splashbench.adapter.messages import DISK_FULL_EXIT, Failure, Outcome, Request
+from splashbench.adapter.returned import check_geometry, check_particles, checked_render
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import raise_if_disk_full, read_model, write_model
 from splashbench.processes import end_with_parent
@@ -31,9 +32,14 @@ def main(request_path: str) -> int:
     """Carry out the request; always leaves an Outcome behind unless the process dies."""
     request = read_model(Path(request_path), Request)
     end_with_parent(request.harness)
-    phase: Callable[[Request, Method, TrainingScene], Outcome] = _fit if request.phase == "fit" else _render
+    phases: dict[str, Callable[[Request, Any, TrainingScene], Outcome]] = {
+        "fit": _fit,
+        "import": _import,
+        "render": _render,
+    }
+    phase = phases[request.phase]
     try:
-        method = load_method(request.method)
+        method: Method | Importer = load_importer(request.importer) if request.importer else load_method(request.method)
         outcome = phase(request, method, Scene.open(Path(request.scene)).training())
     except Failure as failure:
         outcome = Outcome(status=failure.status, reason=failure.reason)
@@ -98,6 +104,12 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
     )
 
 
+def _import(request: Request, importer: Importer, scene: TrainingScene) -> Outcome:
+    fitted = importer.read(Path(request.source), Path(request.export), scene)
+    fitted.save(Path(request.model))
+    return Outcome(peak_device_memory_bytes=_device_peak(), renderer=_renderers())
+
+
 def _reporter(stream: TextIO) -> Callable[[float, str], None]:
     def report(fraction: float, message: str) -> None:
         stream.write(f"{fraction:.4f} {' '.join(message.split())}\n")
@@ -106,27 +118,29 @@ def _reporter(stream: TextIO) -> Callable[[float, str], None]:
     return report
 
 
-def _render(request: Request, method: Method, scene: TrainingScene) -> Outcome:
+def _render(request: Request, method: Method | Importer, scene: TrainingScene) -> Outcome:
     fitted = method.load(Path(request.model), scene)
     output = Path(request.output)
-    views = [(camera, t) for camera in scene.test_cameras.values() for t in range(scene.n_frames)]
+    times = request.times or {name: scene.camera_times[name].tolist() for name in scene.test_cameras}
+    views = [(scene.test_cameras[name], t, time) for name, own in times.items() for t, time in enumerate(own)]
     counts = []
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         report = _reporter(stream)
-        for i, (camera, t) in enumerate(views):
+        for i, (camera, t, time) in enumerate(views):
             _reset_primitive_counter()
             where = f"camera {camera.name}, timestep {t}"
-            render = checked_render(fitted.render(camera, _time(scene, camera, t)), camera, where)
+            render = checked_render(fitted.render(camera, time), camera, where)
             counts.append(_primitive_count())
             write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
             if request.exr:
                 write_exr(output / "exr" / camera.name / f"{t:06d}.exr", render.rgb, render.alpha)
             report((i + 1) / len(views), "rendering the test views")
-    particles = fitted.particles()
+    # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
+    particles = fitted.particles() if request.times is None else None
     if particles is not None:
         check_particles(particles, scene.n_frames)
         particles.save(output / "particles.npz")
-    geometry = fitted.signed_distance()
+    geometry = fitted.signed_distance() if request.times is None else None
     if geometry is not None:
         check_geometry(geometry, scene.n_frames)
         geometry.save(output / "geometry.npz")

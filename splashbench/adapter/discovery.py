@@ -7,6 +7,7 @@ import importlib.util
 import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import Any
 
 from splashbench.adapter.contract import Method, MethodConfig
 from splashbench.errors import SplashbenchError
@@ -14,6 +15,8 @@ from splashbench.errors import SplashbenchError
 GROUP = "splashbench.methods"
 #: Written by the harness itself, since no method sees a test image (adapter/oracle.py).
 ORACLE = "oracle"
+#: A code that runs by commands of its own (adapter/external.py).
+EXTERNAL = "external"
 # What a stranger's module may raise: a script that was taken for a method calls sys.exit().
 _ANYTHING = (Exception, SystemExit)
 
@@ -29,24 +32,29 @@ def load_method(name: str) -> Method:
     Raises SplashbenchError when there is none of that name or its module cannot be imported.
     """
     if ":" in name:
-        return _from_file(name)
+        return _checked(class_from_file(name), name)
     points = registered()
     if name not in points:
-        near = difflib.get_close_matches(name, [*points, ORACLE], n=1)
+        near = difflib.get_close_matches(name, [*points, ORACLE, EXTERNAL], n=1)
         hint = f"did you mean {near[0]!r}?" if near else "see `splashbench methods list`"
         raise SplashbenchError(f"there is no method {name!r}; {hint}")
+    return _checked(load_point(points[name]), name)
+
+
+def load_point(point: EntryPoint) -> Any:
+    """What the entry point names. Raises SplashbenchError where its module cannot be imported."""
     try:
-        method_class = points[name].load()
+        return point.load()
     except ImportError as error:
-        raise SplashbenchError(f"method {name!r} cannot be imported ({error}); install what it needs") from None
+        raise SplashbenchError(f"method {point.name!r} cannot be imported ({error}); install what it needs") from None
     except _ANYTHING as error:
         raise SplashbenchError(
-            f"method {name!r} cannot be imported ({type(error).__name__}: {error}); mend or remove its package"
+            f"method {point.name!r} cannot be imported ({type(error).__name__}: {error}); mend or remove its package"
         ) from None
-    return _checked(method_class, name)
 
 
-def _from_file(name: str) -> Method:
+def class_from_file(name: str) -> Any:
+    """What `FILE.py:CLASS` names. Raises SplashbenchError where there is no such file or class."""
     file, _, class_name = name.rpartition(":")
     path = Path(file)
     if not path.is_file():
@@ -63,7 +71,7 @@ def _from_file(name: str) -> Method:
         raise SplashbenchError(f"{path} cannot be imported ({type(error).__name__}: {error}); mend it") from None
     if not hasattr(module, class_name):
         raise SplashbenchError(f"{path} has no class {class_name!r}; name the method's class after the colon")
-    return _checked(getattr(module, class_name), name)
+    return getattr(module, class_name)
 
 
 def _checked(method_class: type, name: str) -> Method:

@@ -13,10 +13,15 @@ DISK_FULL_EXIT = 28
 
 
 class Request(BaseModel):
-    """What a child process is to do. `phase` fit: scene -> model. `phase` render: model -> test views."""
+    """What a child process is to do: `phase` fit (scene -> model), import (somebody's output -> model), render (model
+    -> test views).
+
+    times: of the views to render, seconds by test camera; by default those of the scene's timesteps.
+    importer: whose models are imported and rendered, instead of the method's; source, export: what it reads them from.
+    """
 
     model_config = ConfigDict(extra="forbid")
-    phase: Literal["fit", "render"]
+    phase: Literal["fit", "import", "render"]
     #: The process that waits for the child, and without which the child must not go on.
     harness: int
     method: str
@@ -34,6 +39,18 @@ class Request(BaseModel):
     timing_frames: int
     exr: bool
     cache: str | None = None
+    times: dict[str, list[float]] | None = None
+    importer: str | None = None
+    source: str = ""
+    export: str = ""
+
+
+class Failure(Exception):
+    """A phase that ended with a status of its own."""
+
+    def __init__(self, status: Status, reason: str) -> None:
+        super().__init__(reason)
+        self.status, self.reason = status, reason
 
 
 class Outcome(BaseModel):

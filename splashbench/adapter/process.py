@@ -1,4 +1,7 @@
-"""Running one child process under observation: wall time, peak memory of its whole tree, progress, a deadline."""
+"""Running one child process under observation: wall time, peak memory of its whole tree, progress, a deadline.
+
+However it ends, everything it started ends with it: its process group, and what left the group but inherited its mark.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,16 +19,25 @@ from splashbench.progress import Bar
 
 _POLL_SECONDS = 0.05
 _LOG_TAIL_LINES = 20
+_LOG_TAIL_BYTES = 20_000
+_TELL_SECONDS = 1.0
+#: In the environment of everything that a watched process starts, with a value of its own for each.
+_MARK = "SPLASHBENCH_RUN"
 
 
 @dataclass
 class Watched:
-    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory."""
+    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory, time.
+
+    strays: processes that had left its process group and were there still; they were killed.
+    """
 
     exit_code: int
     timed_out: bool
     peak_memory_bytes: int
     log_tail: list[str]
+    seconds: float
+    strays: list[str]
 
 
 def run_watched(
@@ -36,18 +49,40 @@ def run_watched(
     timeout_seconds: float | None,
     keep_bar: bool = True,
 ) -> Watched:
-    """Run `python ARGUMENTS` in a process group of its own until it ends or its time is up.
+    """Run `python ARGUMENTS`; see `watch`."""
+    return watch(
+        [sys.executable, *arguments],
+        log=log,
+        progress=progress,
+        label=label,
+        timeout_seconds=timeout_seconds,
+        keep_bar=keep_bar,
+    )
 
-    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, which
-    stays on the terminal with `keep_bar`. Memory is the sum of resident sizes over the process tree, sampled every
-    50 ms.
+
+def watch(
+    command: list[str],
+    *,
+    log: Path,
+    progress: Path,
+    label: str,
+    timeout_seconds: float | None,
+    tell_log: bool = False,
+    keep_bar: bool = True,
+) -> Watched:
+    """Run `command` in a process group of its own until it ends or its time is up.
+
+    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, and with
+    `tell_log` the log's last line is shown where there are none; `keep_bar` leaves it on the terminal. Memory is the
+    sum of resident sizes over the process tree, and the time that the process took is known, to 50 ms.
     """
     environment = dict(os.environ)
+    environment[_MARK] = mark = uuid.uuid4().hex
     # Idle OpenMP threads that spin steal the renderer's cores (research: twice the time on two cores).
     environment.setdefault("OMP_WAIT_POLICY", "passive")
     with log.open("wb") as stream:
         process = subprocess.Popen(
-            [sys.executable, *arguments],
+            command,
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=subprocess.STDOUT,
@@ -57,22 +92,29 @@ def run_watched(
     start, peak, timed_out = time.monotonic(), 0, False
     bar = Bar(label, keep_bar)
     reader = _ProgressReader(progress)
+    told, fraction = start, 0.0
     try:
         while process.poll() is None:
             peak = max(peak, _tree_memory(process.pid))
             for fraction, message in reader.new():
                 bar.update(fraction, message)
+                told = time.monotonic()
+            if tell_log and time.monotonic() - told > _TELL_SECONDS:
+                bar.update(fraction, " ".join(_tail(log)[-1:]))
+                told = time.monotonic()
             if timeout_seconds is not None and time.monotonic() - start > timeout_seconds:
                 timed_out = True
                 break
             time.sleep(_POLL_SECONDS)
+        seconds = time.monotonic() - start
         for fraction, message in reader.new():
             bar.update(fraction, message)
     finally:
         # Also when the user interrupts: a method may have started processes of its own.
         _kill_group(process)
+        strays = _kill_marked(mark, process.pid)
         bar.close()
-    return Watched(process.wait(), timed_out, peak, _tail(log))
+    return Watched(process.wait(), timed_out, peak, _tail(log), seconds, strays)
 
 
 def _tree_memory(pid: int) -> int:
@@ -95,6 +137,20 @@ def _kill_group(process: subprocess.Popen) -> None:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+
+
+def _kill_marked(mark: str, group: int) -> list[str]:
+    """Kill whoever inherited `mark`; a line for each that had left the process group, as daemons do."""
+    import psutil
+
+    strays = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error, OSError):
+            if process.environ().get(_MARK) == mark:
+                if os.getpgid(process.pid) != group:
+                    strays.append(f"{process.name()} (process {process.pid})")
+                process.kill()
+    return strays
 
 
 class _ProgressReader:
@@ -122,5 +178,7 @@ class _ProgressReader:
 
 
 def _tail(log: Path) -> list[str]:
-    text = log.read_bytes()[-20_000:].decode("utf-8", "replace")
+    with log.open("rb") as stream:
+        stream.seek(max(0, log.stat().st_size - _LOG_TAIL_BYTES))
+        text = stream.read().decode("utf-8", "replace")
     return [line.rstrip()[:300] for line in text.splitlines() if line.strip()][-_LOG_TAIL_LINES:]

@@ -5,18 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from splashbench.adapter.contract import Render
+from splashbench.adapter.messages import Failure
 from splashbench.scene import Camera, Particles, SignedDistance
 from splashbench.submission import Status
 
 _OVERSHOOT = 0.5
-
-
-class Failure(Exception):
-    """A phase that ended with a status of its own."""
-
-    def __init__(self, status: Status, reason: str) -> None:
-        super().__init__(reason)
-        self.status, self.reason = status, reason
 
 
 def checked_render(render: Render, camera: Camera, where: str) -> Render:

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from splashbench.adapter import hardware
 from splashbench.adapter.contract import Method
-from splashbench.adapter.discovery import ORACLE, load_method
+from splashbench.adapter.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.adapter.messages import DISK_FULL_EXIT, Outcome, Request
 from splashbench.adapter.process import Watched, run_watched
 from splashbench.adapter.training_view import make_training_view
@@ -24,6 +24,7 @@ from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import atomic_directory, read_model, tree_bytes, write_model
 from splashbench.scene import Particles, Scene
 from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
+from splashbench.submission.withheld import Withheld, kept_timesteps
 from splashbench.version import __version__
 
 #: Protocol v1: the frame rate is the median of at least this many renders.
@@ -45,6 +46,7 @@ def run_method(
     keep_model: bool = True,
     exr: bool = False,
     cache: Path | None = None,
+    withheld: Withheld | None = None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
 
@@ -56,12 +58,19 @@ def run_method(
         keep_model: keep the fitted model under OUT/model, so that it can be rendered again.
         exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
         cache: a folder for what the runs of one study share (adapter/reuse.py); the record says what came from there.
+        withheld: timesteps that the method does not see; they are rendered and scored (submission/withheld.py).
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
     """
     scene = Scene.open(scene_directory)
+    if withheld and scene.n_frames < 3:
+        raise SplashbenchError(f"{scene_directory} has {scene.n_frames} timesteps; to withhold some takes three")
+    if name == EXTERNAL:
+        raise SplashbenchError(
+            "`external` is run by commands: splashbench run external SCENE OUT --name ... --command ..."
+        )
     if name == ORACLE:
-        if preset or overrides:
+        if preset or overrides or withheld:
             raise SplashbenchError("the oracle is the truth itself, without presets or settings; leave them out")
         from splashbench.adapter.oracle import write_oracle
 
@@ -80,6 +89,7 @@ def run_method(
         device=device,
         scene=scene.name,
         scene_digest=scene.digest,
+        withheld=withheld,
     )
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene_directory]) as staging,
@@ -92,7 +102,7 @@ def run_method(
                 phase="fit",
                 harness=os.getpid(),
                 method=name,
-                scene=str(make_training_view(scene, Path(scratch, "scene"))),
+                scene=str(make_training_view(scene, Path(scratch, "scene"), kept_timesteps(scene.n_frames, withheld))),
                 preset=preset,
                 overrides=dict(overrides or {}),
                 seed=seed,
@@ -106,16 +116,11 @@ def run_method(
                 timing_frames=timing_frames,
                 exr=exr,
                 cache=str(cache.resolve()) if cache else None,
+                times={name: scene.camera_times[name].tolist() for name in scene.test} if withheld else None,
             ),
         )
-        if not keep_model or record.status != Status.OK:
-            _remove_tree(staging / "model")
-        if record.status != Status.OK:
-            for name_ in ("renders", "alpha", "exr"):
-                _remove_tree(staging / name_)
-            for name_ in ("particles.npz", "geometry.npz"):
-                (staging / name_).unlink(missing_ok=True)
-        _require_unchanged(scene, method)
+        drop_unwanted(staging, record.status, keep_model)
+        require_unchanged(scene, method.id)
         seal(staging, identity, record)
     return Submission.open(out)
 
@@ -143,15 +148,15 @@ def _identity(method: Method, **run: Any) -> Identity:
     return identity
 
 
-def _require_unchanged(scene: Scene, method: Method) -> None:
-    """Raise SplashbenchError where `scene` is no longer what it was: the method's view of it is links."""
+def require_unchanged(scene: Scene, method: str) -> None:
+    """Raise SplashbenchError where `scene` is no longer what it was: a method's view of it is links."""
     try:
         same = Scene.open(scene.directory).digest == scene.digest
     except SplashbenchError:
         same = False
     if not same:
         raise SplashbenchError(
-            f"{scene.directory} was changed while {method.id} ran, maybe by the method; restore it and run again"
+            f"{scene.directory} was changed while {method} ran, maybe by the method; restore it and run again"
         )
 
 
@@ -161,7 +166,7 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     device_peak: int | None = None
     for phase in ("fit", "render"):
         label = f"{request.method.rpartition('/')[2][:24]}: {phase}"
-        outcome, watched = _run_phase(scratch, request.model_copy(update={"phase": phase}), label)
+        outcome, watched = run_phase(scratch, request.model_copy(update={"phase": phase}), label)
         peak = max(peak, watched.peak_memory_bytes)
         if outcome.peak_device_memory_bytes is not None:
             device_peak = max(device_peak or 0, outcome.peak_device_memory_bytes)
@@ -185,20 +190,24 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
                     "dynamic_bytes": storage - static,
                 }
             )
-    carriers = None
-    if (staging / "particles.npz").is_file():
-        carriers = float(Particles.load(staging / "particles.npz").active.sum(axis=1).mean())
     return record.model_copy(
         update={
             "render_fps": outcome.render_fps,
             "timed_frames": outcome.timed_frames,
             "primitives_per_frame": outcome.primitives_per_frame,
-            "carriers_per_frame": carriers,
+            "carriers_per_frame": carriers_per_frame(staging),
         }
     )
 
 
-def _run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Watched]:
+def carriers_per_frame(staging: Path) -> float | None:
+    """Mean number of active particles in particles.npz, where there is one."""
+    path = staging / "particles.npz"
+    return float(Particles.load(path).active.sum(axis=1).mean()) if path.is_file() else None
+
+
+def run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Watched]:
+    """Carry out `request` in a child process; what it did not live to say is told from how it ended."""
     path, result, progress = scratch / "request.json", Path(request.result), Path(request.progress)
     for stale in (result, progress):
         stale.unlink(missing_ok=True)
@@ -237,6 +246,17 @@ def without_nulls(settings: dict[str, Any]) -> dict[str, Any]:
         if value is not None:
             cleaned[key] = value
     return cleaned
+
+
+def drop_unwanted(staging: Path, status: Status, keep_model: bool) -> None:
+    """Remove what a failed run may have written, and a model that nobody wants."""
+    if not keep_model or status != Status.OK:
+        _remove_tree(staging / "model")
+    if status != Status.OK:
+        for name in ("renders", "alpha", "exr"):
+            _remove_tree(staging / name)
+        for name in ("particles.npz", "geometry.npz"):
+            (staging / name).unlink(missing_ok=True)
 
 
 def _made(path: Path) -> Path:

@@ -1,45 +1,83 @@
-"""The copy of a scene that a method's process is given: no test image and no test mask is in it.
+"""The copy of a scene that a method's process is given: no test image, no test mask and no true particle is in it.
 
-Files are linked, not copied. Poses, sizes and times of test views are there, since a method renders them.
+It is in the released layout, whatever the scene's own. Files of that layout are linked; NeuroFluid's are written
+anew, since there one file holds colours and mask. Poses, sizes and times of test views are there, since a method
+renders them. Timesteps may be withheld, too, to see how a method interpolates: the copy is then of the others alone.
 """
 
 from __future__ import annotations
 
-import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
-from splashbench.files import write_model
-from splashbench.scene import Scene, SceneMeta
+from splashbench.files import read_json, write_json, write_model
+from splashbench.scene import Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
+from splashbench.scene.layout import plain_name
+from splashbench.scene.source import RELEASED_FILES, ReleasedSource
 
 
-def make_training_view(scene: Scene, directory: Path) -> Path:
-    """Write the training view of `scene` into `directory` (made here) and return it."""
+def make_training_view(scene: Scene, directory: Path, kept: Sequence[int] | None = None) -> Path:
+    """Write the training view of `scene` into `directory` (made here) and return it.
+
+    kept: the timesteps that it has, in order; all of them by default.
+    """
     directory = Path(directory)
     directory.mkdir(parents=True)
-    for name in ("train_meta.json", "test_meta.json"):
-        shutil.copyfile(scene.directory / name, directory / name)
+    kept = range(scene.n_frames) if kept is None else kept
+    meta = _shown_meta(scene, kept)
+    if scene.layout == ReleasedSource.layout:
+        for name in RELEASED_FILES:
+            split = read_json(scene.directory / name)
+            write_json(directory / name, split | {key: [split[key][t] for t in kept] for key in ("k", "w2c", "fn")})
+        for camera in scene.train:
+            for t in kept:
+                for path in (scene.image_path(camera, t), scene.mask_path(camera, t)):
+                    _link(path, directory / path.relative_to(scene.directory))
+        write_model(directory / "scene.json", meta)
+    else:
+        pairs = ((camera, i, t) for camera in scene.train for i, t in enumerate(kept))
+        write_scene(
+            directory,
+            cameras=scene.cameras,
+            train=scene.train,
+            test=scene.test,
+            n_frames=len(kept),
+            frames=((camera, i, scene.image(camera, t), scene.mask(camera, t)) for camera, i, t in pairs),
+            meta=meta,
+            shown=scene.train,
+        )
+    _link_extras(scene, directory)
+    return directory
+
+
+def _shown_meta(scene: Scene, kept: Sequence[int]) -> SceneMeta:
+    """What a method is told of `scene` on the timesteps `kept`: nothing of where it came from."""
+    meta = scene.meta or SceneMeta(name=plain_name(scene.name))
+    if meta.container_mesh is not None:
+        # Under a name of its own: made-up scenes keep it beside the truth, which a method is not shown.
+        suffix = mesh_path(scene.directory, meta.container_mesh).suffix.lower()
+        meta = meta.model_copy(update={"container_mesh": f"container{suffix}"})
+    sizes = {name: (camera.width, camera.height) for name, camera in scene.cameras.items()}
+    whole = len(kept) == scene.n_frames
+    times = scene.times[list(kept)].tolist() if scene.times_source != "nominal" or not whole else None
+    own = meta.camera_times and {name: [known[t] for t in kept] for name, known in meta.camera_times.items()}
+    return meta.model_copy(update={"sizes": sizes, "times": times, "camera_times": own, "provenance": {}})
+
+
+def _link_extras(scene: Scene, directory: Path) -> None:
+    """Link what a scene may have besides images and masks of the training views."""
     points = scene.directory / "init_pt_cld.npz"
     if points.is_file():
         _link(points, directory / points.name)
     for camera in scene.train:
-        for t in range(scene.n_frames):
-            for path in (scene.image_path(camera, t), scene.mask_path(camera, t)):
-                _link(path, directory / path.relative_to(scene.directory))
         container = scene.directory / "container_mask" / f"{camera}.png"
         if container.is_file():
             _link(container, directory / container.relative_to(scene.directory))
-    meta = scene.meta or SceneMeta(name=scene.name, times=None)
-    if meta.container_mesh is not None:
-        mesh = mesh_path(scene.directory, meta.container_mesh)
-        # Under a name of its own: made-up scenes keep it beside the truth, which a method is not shown.
-        meta = meta.model_copy(update={"container_mesh": f"container{mesh.suffix.lower()}"})
+    if scene.meta is not None and scene.meta.container_mesh is not None:
+        mesh = mesh_path(scene.directory, scene.meta.container_mesh)
         if mesh.is_file():
             _link(mesh, directory / f"container{mesh.suffix.lower()}")
-    sizes = {name: (camera.width, camera.height) for name, camera in scene.cameras.items()}
-    times = scene.times.tolist() if scene.times_source != "nominal" else None
-    write_model(directory / "scene.json", meta.model_copy(update={"sizes": sizes, "times": times, "provenance": {}}))
-    return directory
 
 
 def _link(source: Path, target: Path) -> None:

@@ -10,7 +10,7 @@ from splashbench.cli.output import add_json, emit, say
 _EPILOG = """\
 examples:
   splashbench leaderboard results leaderboard
-  splashbench leaderboard results leaderboard --with-paper       the paper's figures in panels of their own
+  splashbench leaderboard results leaderboard --with-paper       the paper's figures in panels and tables of their own
 
 OUT gets leaderboard.csv, leaderboard.md, speed_accuracy.png and speed_accuracy.svg. Failed runs keep their rows, and
 runs on different machines never share a chart. The same results give the same bytes.
@@ -28,7 +28,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("results", type=Path, metavar="RESULTS", help="folder with results, from `splashbench score`")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder the leaderboard is written into")
-    parser.add_argument("--with-paper", action="store_true", help="chart the paper's figures, as reported, beside them")
+    parser.add_argument("--with-paper", action="store_true", help="the paper's figures, as reported, beside them")
     add_json(parser)
     parser.set_defaults(handler=run)
 
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     sources = load_results(arguments.results)
     # All four or none: a table without its chart would be taken for whole.
     with files_together(arguments.out) as staging:
-        made = write_leaderboard(sources, staging)
+        made = write_leaderboard(sources, staging, with_paper=arguments.with_paper)
         made += speed_accuracy_chart(sources, staging, with_paper=arguments.with_paper)
     files = [arguments.out / path.name for path in made]
     rows = leaderboard_rows(sources)

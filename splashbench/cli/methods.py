@@ -50,7 +50,7 @@ def _facts(name: str) -> dict[str, Any]:
 
 def list_methods(arguments: argparse.Namespace) -> int:
     """Handle `splashbench methods list`."""
-    from splashbench.adapter.discovery import ORACLE, registered
+    from splashbench.adapter.discovery import EXTERNAL, ORACLE, registered
     from splashbench.errors import SplashbenchError
 
     rows: list[dict[str, Any]] = []
@@ -62,6 +62,14 @@ def list_methods(arguments: argparse.Namespace) -> int:
             rows.append({"id": name, "title": f"cannot be loaded: {error}", "control": False, "presets": {}})
     rows.append(
         {"id": ORACLE, "title": "the ground truth itself, written by the harness", "control": True, "presets": {}}
+    )
+    rows.append(
+        {
+            "id": EXTERNAL,
+            "title": "a code run by its own commands (docs/external_methods.md)",
+            "control": False,
+            "presets": {},
+        }
     )
     if arguments.json:
         emit({"methods": rows})
@@ -76,11 +84,13 @@ def list_methods(arguments: argparse.Namespace) -> int:
 
 def show_method(arguments: argparse.Namespace) -> int:
     """Handle `splashbench methods show`."""
-    from splashbench.adapter.discovery import ORACLE, load_method
+    from splashbench.adapter.discovery import EXTERNAL, ORACLE, load_method
     from splashbench.errors import SplashbenchError
 
     if arguments.method == ORACLE:
         raise SplashbenchError("the oracle is written by the harness and has no settings; just run it")
+    if arguments.method == EXTERNAL:
+        raise SplashbenchError("an external code's settings are in its commands; see `splashbench run --help`")
     method = load_method(arguments.method)
     default = next(iter(method.Config.presets))
     facts = _facts(arguments.method)

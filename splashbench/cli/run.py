@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from splashbench.cli import external
 from splashbench.cli.output import add_json, emit, say
+
+if TYPE_CHECKING:
+    from splashbench.submission import Submission
 
 _EPILOG = """\
 examples:
@@ -14,6 +19,10 @@ examples:
   splashbench run nothing SCENE OUT                 the frozen background alone, the reference for dPSNR
   splashbench run oracle SCENE OUT                  the ground truth itself, a check of the scoring
   splashbench run my_method.py:MyMethod SCENE OUT   a method that is not installed (CONTRIBUTING.md)
+  splashbench run external SCENE OUT --name theirs --format blender \\
+    --command "/envs/theirs/bin/python train.py -s {scene} -m {out} --seed {seed}" \\
+    --render-command "/envs/theirs/bin/python render_views.py -m {out} --views {views} --to {into}"
+                                                    a code in an environment of its own (docs/external_methods.md)
 
 A method that crashes, hangs, runs out of memory or returns NaN gives a submission with that status, and exit status 1.
 It is a program with your rights: run a stranger's method in a container.
@@ -29,7 +38,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("method", help="a name from `splashbench methods list`, `oracle`, or FILE.py:CLASS")
+    parser.add_argument("method", help="a name from `splashbench methods list`, `oracle`, `external`, or FILE.py:CLASS")
     parser.add_argument("scene", type=Path, help="folder of the scene")
     parser.add_argument("out", type=Path, help="folder of the submission, made by the run")
     parser.add_argument("--preset", help="settings by name; see `splashbench methods show METHOD`")
@@ -45,11 +54,17 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         metavar="N",
         help="frames timed for FPS (default 100; of fewer it is not scored)",
     )
+    parser.add_argument(
+        "--withhold",
+        choices=["odd"],
+        help="keep every second timestep from the method; these are rendered, and they alone are scored",
+    )
     parser.add_argument("--exr", action="store_true", help="write the renders also as OpenEXR, for compositing")
     parser.add_argument("--no-model", action="store_true", help="do not keep the fitted model under OUT/model")
     parser.add_argument("--replace", action="store_true", help="replace OUT when it exists")
     add_json(parser)
-    parser.set_defaults(handler=run)
+    external.add_options(parser)
+    parser.set_defaults(handler=run, usage_error=parser.error)
 
 
 def _not_negative(text: str) -> int:
@@ -70,23 +85,12 @@ def seconds_above_zero(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench run`."""
-    from splashbench.adapter.runner import TIMING_FRAMES, parse_overrides, run_method
     from splashbench.errors import one_line
 
-    submission = run_method(
-        arguments.method,
-        arguments.scene,
-        arguments.out,
-        preset=arguments.preset,
-        overrides=parse_overrides(arguments.overrides),
-        seed=arguments.seed,
-        device=arguments.device,
-        timeout_seconds=arguments.timeout,
-        timing_frames=TIMING_FRAMES if arguments.timing_frames is None else arguments.timing_frames,
-        exr=arguments.exr,
-        keep_model=not arguments.no_model,
-        replace=arguments.replace,
-    )
+    fault = external.fault(arguments)
+    if fault:
+        arguments.usage_error(fault)
+    submission = external.run(arguments) if arguments.method == external.NAME else _run_method(arguments)
     record = submission.record
     if arguments.json:
         emit(submission.identity.model_dump(mode="json") | record.model_dump(mode="json"))
@@ -99,3 +103,23 @@ def run(arguments: argparse.Namespace) -> int:
     cost = f", fit in {record.fit_seconds:.1f} s" if record.fit_seconds is not None else ""
     say(f"{submission.identity.method}: ok{cost}; submission in {arguments.out}")
     return 0
+
+
+def _run_method(arguments: argparse.Namespace) -> Submission:
+    from splashbench.adapter.runner import TIMING_FRAMES, parse_overrides, run_method
+
+    return run_method(
+        arguments.method,
+        arguments.scene,
+        arguments.out,
+        preset=arguments.preset,
+        overrides=parse_overrides(arguments.overrides),
+        seed=arguments.seed,
+        device=arguments.device,
+        timeout_seconds=arguments.timeout,
+        timing_frames=TIMING_FRAMES if arguments.timing_frames is None else arguments.timing_frames,
+        exr=arguments.exr,
+        withheld=arguments.withhold,
+        keep_model=not arguments.no_model,
+        replace=arguments.replace,
+    )

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splashbench.adapter.contract import Fitted, Render
-from splashbench.adapter.returned import Failure, check_geometry, check_particles, checked_render
+from splashbench.adapter.messages import Failure
+from splashbench.adapter.returned import check_geometry, check_particles, checked_render
 from splashbench.conformance.messages import Held, Kind, Seen
 from splashbench.scene import Camera, TrainingScene
 

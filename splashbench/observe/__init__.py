@@ -6,6 +6,7 @@ Needs no torch. The kernels are compiled at first use (a few seconds) and cached
 from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import sequence_bounds
+from splashbench.observe.initial_points import initial_points
 from splashbench.observe.shadow import ContainerShadow
 from splashbench.observe.signed_distance import (
     SignedDistanceFields,
@@ -21,6 +22,7 @@ __all__ = [
     "SignedDistanceFields",
     "Silhouettes",
     "distrust_failed_masks",
+    "initial_points",
     "sequence_bounds",
     "signed_distance_fields",
     "signed_distance_frames",

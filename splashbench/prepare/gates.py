@@ -35,6 +35,7 @@ class Gate:
     side: Literal["at most", "at least"]
     detail: str
     essential: bool = False
+    remedy: str = "film it again"
 
     @property
     def passed(self) -> bool:
@@ -151,8 +152,8 @@ def metric_gates(frame: SceneFrame) -> list[Gate]:
     if frame.scale_disagreement is not None:
         detail = f"share, largest difference between {', '.join(frame.scales)}"
         gates.append(Gate("scale_agreement", frame.scale_disagreement, 0.01, "at most", detail))
-        beyond = f"as above; {frame.scale_source} would be taken, but one of them is wrong"
-        gates.append(Gate("scale_is_one", frame.scale_disagreement, 0.1, "at most", beyond, essential=True))
+        remedy = "measure them again, and mend or leave out the wrong one in session.toml"
+        gates.append(Gate("scale_is_one", frame.scale_disagreement, 0.1, "at most", detail, True, remedy))
     return gates
 
 
@@ -185,9 +186,8 @@ def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -
         gates.append(
             Gate("container_iou", overlap, 0.95, "at least", "projected mesh and mask, median of training views")
         )
-        gates.append(
-            Gate("container_is_the_container", overlap, 0.8, "at least", "as above; below it, it is another mesh", True)
-        )
+        beyond, remedy = "as above; below it, it is another mesh", "check mesh, masks and metres_per_unit"
+        gates.append(Gate("container_is_the_container", overlap, 0.8, "at least", beyond, True, remedy))
         known = {camera: seen[camera].contour_median_px for camera in fitted}
         medians = {camera: np.inf if found is None else found for camera, found in known.items()}
         worst = max(fitted, key=medians.__getitem__)
@@ -207,8 +207,8 @@ def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -
         detail = f"px RMS between clicked and projected points, camera {worst}"
         gates.append(Gate("container_clicks", clicked[worst], max(5.0, width / 400), "at most", detail))
         if not fitted:  # nothing else tells whether the clicks make sense
-            beyond = "as above; beyond this the clicks are of something else"
-            gates.append(Gate("container_clicks_fit", clicked[worst], width / 40, "at most", beyond, essential=True))
+            remedy = "check the points under [container]"
+            gates.append(Gate("container_clicks_fit", clicked[worst], width / 40, "at most", detail, True, remedy))
     up = np.asarray(placement.up)
     tilt = float(np.degrees(np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))))
     gates.append(Gate("container_upright", tilt, 2.0, "at most", "degrees between its axis and the scene's up"))
@@ -228,5 +228,5 @@ def require(gates: Iterable[Gate], source: str) -> None:
             value = "unknown" if gate.value is None else f"{gate.value:.4g}"
             raise SplashbenchError(
                 f"{source}: {gate.name} is {value}, {gate.side} {gate.limit:.4g} is needed ({gate.detail});"
-                " film it again"
+                f" {gate.remedy}"
             )

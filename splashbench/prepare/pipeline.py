@@ -8,7 +8,6 @@ succeeded; its bytes do not depend on how often that was interrupted.
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_directory, sha256_file, write_json, write_text
+from splashbench.files import atomic_directory, is_staged_for, sha256_file, write_json, write_text
 from splashbench.prepare import gates as g
 from splashbench.prepare.calibration.board import Detector
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.undistort import Undistorter
 from splashbench.prepare.container import stage as container_stage
+from splashbench.prepare.container.check import overlay
 from splashbench.prepare.container.stage import PlacedContainer
 from splashbench.prepare.crop import Box
 from splashbench.prepare.film import motion, sampling
@@ -46,13 +46,14 @@ from splashbench.prepare.sound.sync import ClockFit, SequenceSync
 from splashbench.prepare.stages import Stage, StageStore, facts_of, open_stages
 from splashbench.progress import track
 from splashbench.scene.camera import Camera
+from splashbench.scene.container import ContainerMesh, read_mesh
 from splashbench.scene.layout import SceneMeta
 from splashbench.scene.writing import write_scene
 
 SHEET_COLUMNS = 6  # timesteps on the report's contact sheet
+OVERLAY_WIDTH = 480  # pixels of a frame with the container drawn on it
 WORK_FOLDER = "prepare"  # within the session
 _UNFINISHED = "unfinished_scene.txt"
-_STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-.+")
 
 ImageFormat = Literal["png", "jpg"]
 Image = NDArray[np.uint8]
@@ -109,7 +110,7 @@ def _unfinished_removed(work: Path, scene_directory: Path) -> Iterator[None]:
     note = work / _UNFINISHED
     if note.is_file():
         left = Path(note.read_bytes()[:4096].decode("utf-8", "replace"))
-        if left.parent == Path(scene_directory).resolve().parent and _STAGED.fullmatch(left.name):
+        if is_staged_for(left, scene_directory):
             shutil.rmtree(left, ignore_errors=True)
     yield
     note.unlink(missing_ok=True)
@@ -143,7 +144,8 @@ class _Run:
         container_masks = container_stage.container_masks(session.container_folder, undistorters)
         frame = self._metric(posed, undistorters, container_masks, recordings.detector)
         placed = metric.transformed(posed.poses, frame.scene_from_sfm)
-        paths = self._sound_paths(placed.w2c)
+        whole = _pinholes(lenses, placed.w2c)
+        paths = self._sound_paths(whole)
         clocks = sync.shifted(heard.clocks, paths.shift_s) if paths.applied else heard.clocks
         if paths.applied:
             sampled = self._sampling(clocks, interval, "sampling")
@@ -156,7 +158,6 @@ class _Run:
         ]
         g.require(gates, str(session.directory))
 
-        whole = _pinholes(lenses, placed.w2c)
         container = self._container(whole, container_masks, undistorters)
         if container is not None:
             gates += g.container_gates(container, session.train, lenses[cameras[0]].width)
@@ -170,8 +171,8 @@ class _Run:
             write_scene(
                 directory,
                 cameras={
-                    name: camera.cropped(box.x0, box.y0, box.width, box.height)
-                    for (name, camera), box in zip(whole.items(), (windows[name] for name in whole))
+                    name: camera.cropped(windows[name].x0, windows[name].y0, windows[name].width, windows[name].height)
+                    for name, camera in whole.items()
                 },
                 train=session.train,
                 test=session.test,
@@ -209,12 +210,17 @@ class _Run:
 
     def _check_what_later_stages_need(self) -> None:
         """Faults that can be seen at once are told at once, not after the hours of the stages before."""
-        if self.session.container is not None:
-            container_stage.container_mesh(self.session)
+        if self.container_mesh is not None:
             sizes = {camera: probe(recording.paths[0]) for camera, recording in self.pour.items()}
             container_stage.check_masks(self.session, {name: (i.width, i.height) for name, i in sizes.items()})
         if self.options.masks is None and self.session.masks.provider == "sam3":
             masking.sam3_provider(self.session, self.pour)
+
+    @cached_property
+    def container_mesh(self) -> ContainerMesh | None:
+        """The scanned container in its own coordinates, where the session has one."""
+        path = self.session.container_mesh
+        return None if path is None else read_mesh(path)
 
     @cached_property
     def pour(self) -> dict[str, Recording]:
@@ -319,19 +325,21 @@ class _Run:
 
         def make() -> SceneFrame:
             container = None
-            if session.container is not None and not rig.prints_are_seen(posed, session, detector):
+            if self.container_mesh is not None and not rig.prints_are_seen(posed, session, detector):
                 lenses = {camera: undistorter.lens for camera, undistorter in undistorters.items()}
                 cameras = list(_pinholes(lenses, posed.poses.w2c).values())
-                container = container_stage.upright_container(session, cameras, container_masks, undistorters)
+                container = container_stage.upright_container(
+                    session, self.container_mesh, cameras, container_masks, undistorters
+                )
             return rig.find_frame(posed, session, detector, container)
 
         return self.store.result("metric", SceneFrame, inputs, make)
 
-    def _sound_paths(self, w2c: Mapping[str, NDArray[np.float64]]) -> SoundPaths:
+    def _sound_paths(self, whole: Mapping[str, Camera]) -> SoundPaths:
         """What the sound's travel does to the clocks, now that the cameras' places are known."""
         given = self.session.sound
         source = given.source if given else (0.0, 0.0, 0.0)
-        positions = {camera: -matrix[:3, :3].T @ matrix[:3, 3] for camera, matrix in w2c.items()}
+        positions = {name: camera.center for name, camera in whole.items()}
         distance, shift = sync.sound_paths(positions, source, self.session.reference)
         return SoundPaths(source, given is not None, distance, shift)
 
@@ -339,7 +347,8 @@ class _Run:
         self, whole: Mapping[str, Camera], masks: Mapping[str, Mask], undistorters: Mapping[str, Undistorter]
     ) -> PlacedContainer | None:
         """The container's mesh in the scene; `whole`: cameras of uncropped frames. None where the session has none."""
-        if self.session.container is None:
+        mesh = self.container_mesh
+        if mesh is None:
             return None
         inputs = {
             "files": facts_of(container_stage.container_files(self.session)),
@@ -352,19 +361,21 @@ class _Run:
             "container",
             PlacedContainer,
             inputs,
-            lambda: container_stage.place_container(self.session, list(whole.values()), masks, undistorters),
+            lambda: container_stage.place_container(self.session, mesh, list(whole.values()), masks, undistorters),
         )
 
     def _overlays(
         self, container: PlacedContainer | None, whole: Mapping[str, Camera], masks: Mapping[str, Mask]
     ) -> Callable[[str, Image], None]:
         """Keeps, given a camera and an undistorted whole frame of it, the placed container drawn on it."""
-        if container is None:
+        mesh = self.container_mesh
+        if mesh is None or container is None:
             return lambda camera, image: None
-        mesh, placed = container_stage.container_mesh(self.session), container
+        pose = container.placement.pose
 
         def keep(camera: str, image: Image) -> None:
-            self.overlays[camera] = container_stage.overlay_image(mesh, placed, whole[camera], masks.get(camera), image)
+            width = min(OVERLAY_WIDTH, whole[camera].width)
+            self.overlays[camera] = overlay(mesh, pose, whole[camera], masks.get(camera), image, width)
 
         return keep
 

@@ -264,12 +264,6 @@ class Session(_Strict):
             unknown = [camera for camera in listed if camera not in self.cameras]
             if unknown:
                 raise ValueError(f"[recordings.{kind}] names camera {unknown[0]}, which `cameras` does not list")
-        if self.marker is not None and self.board is not None and self.marker.dictionary == self.board.dictionary:
-            on_board = self.board.squares_x * self.board.squares_y // 2
-            if self.marker.id < on_board:
-                raise ValueError(
-                    f"marker {self.marker.id} is also on the board, whose are 0 to {on_board - 1}; print another"
-                )
         if self.distance is not None:
             unknown = [camera for camera in self.distance.cameras if camera not in self.cameras]
             if unknown:

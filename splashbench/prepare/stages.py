@@ -55,7 +55,7 @@ class StageStore:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.records: dict[Stage, StageRecord] = {}
-        self._versions = {name: importlib.metadata.version(name) for name in _LIBRARIES}
+        self._versions = {name: importlib.metadata.version(name) for name in _LIBRARIES} | {"code": _code_digest()}
 
     def result(self, stage: Stage, kind: Any, inputs: Mapping[str, Any], make: Callable[[], T], part: str = "") -> T:
         """The stored result of `stage` where it was made from the same `inputs`, else what `make` returns, stored.
@@ -136,6 +136,14 @@ class StageStore:
     def _key(self, stage: Stage, part: str, inputs: Mapping[str, Any]) -> str:
         made_from = {"stage": stage, "part": part, "splashbench": __version__, **self._versions, "inputs": inputs}
         return hashlib.sha256(json.dumps(_plain(made_from), sort_keys=True).encode()).hexdigest()
+
+
+def _code_digest() -> str:
+    """SHA-256 of this package's source: a version alone does not tell an edited checkout from what it was."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 @contextmanager

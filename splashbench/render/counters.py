@@ -5,6 +5,9 @@ Counted per camera, before anything is culled. Plain module state: a method runs
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 last: int = 0
 """Gaussians of the latest rendering, frozen ones included."""
 _calls: int = 0
@@ -25,6 +28,17 @@ def record(primitives: int, backend: str) -> None:
     _calls += 1
     _total += primitives
     _backends.add(backend)
+
+
+@contextmanager
+def uncounted() -> Iterator[None]:
+    """Render within without counting, as for an opacity that is asked for beside the image itself."""
+    global last, _calls, _total
+    before = last, _calls, _total
+    try:
+        yield
+    finally:
+        last, _calls, _total = before
 
 
 def calls() -> int:

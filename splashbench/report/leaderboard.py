@@ -73,13 +73,13 @@ def leaderboard_rows(sources: Sequence[Source]) -> list[Row]:
 
 def table_of(row: Row) -> tuple[str, str, str]:
     """What rows must share to stand in one table: scene, its exact bytes, and protocol."""
-    return (row.first.scene, row.first.digests.scene, row.first.protocol.label)
+    return (row.first.scene, row.first.digests.scene, row.first.protocol_label)
 
 
 def _identity(result: Result) -> tuple:
     """What runs must share to be one row; failed runs never share one."""
     return (
-        (result.scene, result.digests.scene, result.protocol.label),
+        (result.scene, result.digests.scene, result.protocol_label),
         (result.method, result.preset, settings_digest(result), hardware_label(result.hardware)),
         "" if result.status == "ok" else result.digests.submission,
     )
@@ -107,7 +107,7 @@ def to_csv(rows: Sequence[Row]) -> str:
                 *(format_value(name, row.value(name)) for name in _FIGURES),
                 *(str(run.control).lower(), str(run.mixed).lower(), len(row.runs)),
                 *(format_value(name, row.spread(name)) for name in _SPREAD),
-                *(run.method_version, settings_digest(run), run.protocol.label, run.digests.scene),
+                *(run.method_version, settings_digest(run), run.protocol_label, run.digests.scene),
                 hardware_label(run.hardware),
                 *(format_value(name, row.value(name)) for name in TRUTH_METRICS),
                 *(format_value(name, row.spread(name)) for name in TRUTH_METRICS),
@@ -120,12 +120,15 @@ def _seeds(row: Row) -> str:
     return " ".join(str(run.seed) for run in row.runs)
 
 
-def write_leaderboard(sources: Sequence[Source], out: Path) -> list[Path]:
-    """Write leaderboard.csv and leaderboard.md into the folder `out`; returns their paths."""
+def write_leaderboard(sources: Sequence[Source], out: Path, with_paper: bool = False) -> list[Path]:
+    """Write leaderboard.csv and leaderboard.md into the folder `out`; returns their paths.
+
+    with_paper: below a scene's table in the Markdown, what the paper reports for that scene. The CSV never has it.
+    """
     from splashbench.report.markdown import to_markdown
 
     rows = leaderboard_rows(sources)
     paths = [Path(out, "leaderboard.csv"), Path(out, "leaderboard.md")]
-    for path, text in zip(paths, (to_csv(rows), to_markdown(rows, sources))):
+    for path, text in zip(paths, (to_csv(rows), to_markdown(rows, sources, with_paper))):
         write_text(path, text)
     return paths

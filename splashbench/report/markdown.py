@@ -8,6 +8,7 @@ from itertools import groupby
 from statistics import fmean
 
 from splashbench.report.leaderboard import Row, table_of
+from splashbench.report.reported import reported_table
 from splashbench.report.results import Source, hardware_label, settings_digest
 from splashbench.score.metrics import METRICS, TRUTH_METRICS, format_value
 
@@ -29,8 +30,8 @@ _NONE = "–"
 _NOT_RANKED = ("sigma_d", "mu_d")
 
 
-def to_markdown(rows: Sequence[Row], sources: Sequence[Source]) -> str:
-    """The whole document. `rows` as ordered by `leaderboard_rows`."""
+def to_markdown(rows: Sequence[Row], sources: Sequence[Source], with_paper: bool = False) -> str:
+    """The whole document. `rows` as ordered by `leaderboard_rows`; `with_paper`: tables of the paper's own figures."""
     machines = sorted({hardware_label(row.first.hardware) for row in rows})
     letters = {machine: _letter(i) for i, machine in enumerate(machines)}
     parts = [
@@ -43,6 +44,8 @@ def to_markdown(rows: Sequence[Row], sources: Sequence[Source]) -> str:
         members = list(group)
         parts += [f"## {scene} (protocol {protocol}, scene {digest[:8]})", _scene_table(members, letters)]
         parts += _truth_table(members)
+        reported = reported_table(scene) if with_paper else None
+        parts += [reported[0], _joined(reported[1])] if reported else []
     parts += _means(rows, letters)
     parts += ["## Hardware", _bullets(f"{letters[machine]}: {_one_line(machine)}" for machine in machines)]
     parts += _failures(rows) + _claims(rows) + _nulls(rows)
@@ -124,8 +127,8 @@ def _cost_cell(row: Row, name: str) -> str:
 def _means(rows: Sequence[Row], letters: dict[str, str]) -> list[str]:
     """Means over scenes, of methods that have a score on every scene: a mean over the easy ones would flatter."""
     parts = []
-    for protocol in sorted({row.first.protocol.label for row in rows}):
-        members = [row for row in rows if row.first.protocol.label == protocol]
+    for protocol in sorted({row.first.protocol_label for row in rows}):
+        members = [row for row in rows if row.first.protocol_label == protocol]
         scenes = {row.first.digests.scene for row in members}
         if len(scenes) > 1:
             parts += [

@@ -57,7 +57,7 @@ def _refuse_repeats(sources: list[Source]) -> None:
     seen: dict[tuple[str, ...], Source] = {}
     for source in sources:
         result = source.result
-        same = (result.digests.scene, result.digests.protocol, result.method, result.preset)
+        same = (result.digests.scene, result.protocol_label, result.method, result.preset)
         key = (*same, str(result.seed), settings_digest(result), hardware_label(result.hardware))
         if key in seen:
             raise SplashbenchError(

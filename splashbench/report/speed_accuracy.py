@@ -119,7 +119,7 @@ def machines(sources: Sequence[Source]) -> list[Machine]:
     """
     by_machine: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for source in sources:
-        by_machine[hardware_label(source.result.hardware), source.result.protocol.label].append(source.result)
+        by_machine[hardware_label(source.result.hardware), source.result.protocol_label].append(source.result)
     return [_machine(title, protocol, results) for (title, protocol), results in sorted(by_machine.items())]
 
 

@@ -18,7 +18,7 @@ def check_scene(directory: Path) -> list[str]:
     except SplashbenchError as error:
         return [str(error)]
     faults: list[str] = []
-    empty = dict.fromkeys(scene.cameras, 0)
+    empty, full = dict.fromkeys(scene.cameras, 0), dict.fromkeys(scene.cameras, 0)
     pairs = [(camera, t) for camera in scene.cameras for t in range(scene.n_frames)]
     for camera, t in track(pairs, "checking the scene"):
         for read in (scene.image, scene.mask):
@@ -28,9 +28,13 @@ def check_scene(directory: Path) -> list[str]:
                 faults.append(str(error))
                 continue
             empty[camera] += int(read == scene.mask and not array.any())
-    for camera, count in empty.items():
-        if count == scene.n_frames:
-            faults.append(f"{scene.directory / 'seg' / camera}: every mask is empty; the camera shows no liquid")
+            full[camera] += int(read == scene.mask and array.all())
+    for camera in scene.cameras:
+        folder = scene.mask_path(camera, 0).parent
+        if empty[camera] == scene.n_frames:
+            faults.append(f"{folder}: every mask is empty; the camera shows no liquid")
+        if full[camera] == scene.n_frames:
+            faults.append(f"{folder}: every mask is full; the camera shows no outline of the liquid")
     for optional in (scene.initial_points, scene.container_mesh, scene.truth_particles):
         try:
             optional()
@@ -41,7 +45,8 @@ def check_scene(directory: Path) -> list[str]:
             scene.container_mask(camera)
         except SplashbenchError as error:
             faults.append(str(error))
-    return faults
+    # Where image and mask are one file, its fault is one too.
+    return list(dict.fromkeys(faults + scene.faults()))
 
 
 def describe_scene(scene: Scene) -> dict:
@@ -53,6 +58,7 @@ def describe_scene(scene: Scene) -> dict:
     points = scene.initial_points()
     return {
         "name": scene.name,
+        "layout": scene.layout,
         "frames": scene.n_frames,
         "interval_seconds": float(scene.times[-1] - scene.times[0]),
         "times_source": scene.times_source,
@@ -63,7 +69,7 @@ def describe_scene(scene: Scene) -> dict:
         "gravity": scene.gravity.tolist() if scene.gravity is not None else None,
         "metres_per_unit": scene.metres_per_unit,
         "initial_points": 0 if points is None else len(points),
-        "truth_particles": (scene.directory / "truth" / "particles.npz").is_file(),
+        "truth_particles": scene.has_truth,
         "released": scene.is_released,
         "digest": scene.digest,
     }

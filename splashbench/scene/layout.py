@@ -22,7 +22,7 @@ _IMAGE_PATH = re.compile(r"[A-Za-z0-9_][\w-]*/[A-Za-z0-9_][\w.-]*\.(?:jpg|jpeg|p
 # The cameras are bolted down; anything beyond rounding is a moving camera, which nothing here supports.
 _STATIC_TOLERANCE = 1e-6
 # Pixels, scene units or seconds: nothing real comes near, and sums and squares stay finite.
-_LARGEST = 1e9
+LARGEST = 1e9
 
 
 class _MetaFile(BaseModel):
@@ -52,8 +52,8 @@ class SplitFile:
         n_cameras = len(meta.fn[0]) if n_frames else 0
         if not n_frames or any(len(row) != n_cameras for row in meta.fn):
             raise SplashbenchError(f"{path}: fn must hold one list of image paths per frame, all of one length")
-        intrinsics = _static(path, "k", meta.k, (n_frames, n_cameras, 3, 3))
-        w2c = _static(path, "w2c", meta.w2c, (n_frames, n_cameras, 4, 4))
+        intrinsics = static_matrices(path, "k", meta.k, (n_frames, n_cameras, 3, 3))
+        w2c = static_matrices(path, "w2c", meta.w2c, (n_frames, n_cameras, 4, 4))
         for row in meta.fn:
             for name in row:
                 if not _IMAGE_PATH.fullmatch(name) or ".." in name:
@@ -74,7 +74,7 @@ class SplitFile:
         self.K, self.w2c, self.size, self.n_frames = intrinsics, w2c, (meta.w, meta.h), n_frames
 
 
-def _static(path: Path, key: str, values: list, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def static_matrices(path: Path, key: str, values: list, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """The first frame's matrices [C, ...] of `values`, after checking shape, finiteness and that nothing moves."""
     wanted = "x".join(map(str, shape))
     try:
@@ -86,9 +86,9 @@ def _static(path: Path, key: str, values: list, shape: tuple[int, ...]) -> NDArr
     if array.shape != shape:
         found = "x".join(map(str, array.shape))
         raise SplashbenchError(f"{path}: {key} is {found}; it must be {wanted} (frames, cameras, rows, columns)")
-    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > LARGEST:
         raise SplashbenchError(
-            f"{path}: {key} has entries that are not finite or beyond {_LARGEST:g}; write the calibration again"
+            f"{path}: {key} has entries that are not finite or beyond {LARGEST:g}; write the calibration again"
         )
     scale = max(1.0, float(np.abs(array[0]).max(initial=0.0)))
     if np.abs(array - array[0]).max(initial=0.0) > _STATIC_TOLERANCE * scale:
@@ -137,7 +137,12 @@ class SceneMeta(BaseModel):
         return self
 
 
+def plain_name(text: str) -> str:
+    """`text`, such as a folder's name, as a name that `SceneMeta` takes: other characters become "_"."""
+    return re.sub(r"[^A-Za-z0-9_.-]+|^[.-]+", "_", text)[:100] or "_"
+
+
 def _check_times(what: str, times: list[float]) -> None:
     array = np.asarray(times, dtype=np.float64)
-    if not (np.abs(array) <= _LARGEST).all() or (np.diff(array) <= 0).any():
+    if not (np.abs(array) <= LARGEST).all() or (np.diff(array) <= 0).any():
         raise ValueError(f"{what} must be finite and strictly increasing")

@@ -1,7 +1,7 @@
 """A scene: synchronised images and liquid masks of calibrated, fixed cameras, with a training and a test split.
 
-`Scene.open` reads the released layout, with or without scene.json (docs/scene_format.md). Images are read when
-asked for, never all at once. `TrainingScene` is what a method sees: training views, and of test views the poses.
+`Scene.open` reads the released layout, with or without scene.json, and NeuroFluid's (docs/scene_format.md). Images are
+read when asked for, never all at once. `TrainingScene` is what a method sees: training views, of test views the poses.
 """
 
 from __future__ import annotations
@@ -10,16 +10,20 @@ import hashlib
 import json
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import image_size, read_gray, read_image, read_model, read_npz, sha256_file
+from splashbench.files import image_size, read_gray, read_npz, sha256_file
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, mesh_path, read_mesh
-from splashbench.scene.layout import SceneMeta, SplitFile
+from splashbench.scene.neurofluid import NeuroFluidSource, is_neurofluid
 from splashbench.scene.particles import Particles
+from splashbench.scene.source import ReleasedSource, Source
+
+Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.bool_])
 
 # Without timestamps a scene still has an order; metrics that need seconds look at `times_source`.
 NOMINAL_STEP_SECONDS = 1 / 30
@@ -29,33 +33,24 @@ class Scene:
     """A scene on disk. Use `Scene.open`.
 
     Attributes:
-        directory, name: where it lies and what it is called.
+        directory, name: where it lies and what it is called. layout: "released" or "neurofluid", that of its files.
         cameras: name -> Camera, training cameras first.
         train, test: camera names of the split.
         frames: file stems of the timesteps, such as "000000".
-        times: [T] seconds; times_source says whether they come from "scene.json", the "manifest" or are "nominal".
+        times: [T] seconds; times_source says whether they come from "scene.json", the "manifest" (Table S1), follow
+            from "neurofluid"'s fixed interval, or are "nominal".
         camera_times: camera name -> [T] seconds, each camera's own where known, else `times`.
         gravity: unit vector [3] along which things fall, or None. metres_per_unit: metric scale, or None.
         container_transparent: whether the liquid is seen through the container's walls, or None where unknown.
         is_released: whether this is one of the 20 released scenes, in the release's units.
     """
 
-    def __init__(self, directory: Path, train: SplitFile, test: SplitFile, meta: SceneMeta | None) -> None:
-        self.directory = Path(directory)
-        self.name = meta.name if meta else self.directory.resolve().name
-        self.meta = meta
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.directory, self.layout = source.directory, source.layout
+        self.name, self.meta = source.name, source.meta
+        train, test = source.train, source.test
         self.train, self.test = train.names, test.names
-        if train.n_frames != test.n_frames:
-            raise SplashbenchError(
-                f"{directory}: train_meta.json has {train.n_frames} frames and test_meta.json {test.n_frames}; "
-                "both splits must cover the same timesteps"
-            )
-        shared = set(train.names) & set(test.names)
-        if shared:
-            raise SplashbenchError(
-                f"{directory}: camera {min(shared)} is in train_meta.json and test_meta.json; keep it in one"
-            )
-        self._paths = train.paths | test.paths
         self.frames = tuple(Path(path).stem for path in train.paths[train.names[0]])
         self.n_frames = len(self.frames)
         self.cameras: dict[str, Camera] = {}
@@ -65,8 +60,9 @@ class Scene:
                 try:
                     self.cameras[name] = Camera(name, width, height, split.K[c], split.w2c[c])
                 except ValueError as error:
-                    raise SplashbenchError(f"{directory}: {error}; mend the calibration") from None
+                    raise SplashbenchError(f"{self.directory}: {error}; mend the calibration") from None
         self._set_times()
+        meta = self.meta
         self.gravity = np.array(meta.gravity) if meta and meta.gravity else None
         self.metres_per_unit = meta.metres_per_unit if meta else None
         self.container_transparent = meta.container_transparent if meta else None
@@ -77,12 +73,7 @@ class Scene:
         directory = Path(directory)
         if not directory.is_dir():
             raise SplashbenchError(f"{directory} is not a folder; give the folder of a scene")
-        for name in ("train_meta.json", "test_meta.json"):
-            if not (directory / name).is_file():
-                raise SplashbenchError(f"{directory / name} is missing; a scene has train_meta.json and test_meta.json")
-        meta_path = directory / "scene.json"
-        meta = read_model(meta_path, SceneMeta) if meta_path.exists() or meta_path.is_symlink() else None
-        return cls(directory, SplitFile(directory / "train_meta.json"), SplitFile(directory / "test_meta.json"), meta)
+        return cls(NeuroFluidSource(directory) if is_neurofluid(directory) else ReleasedSource(directory))
 
     def _size(self, camera: str) -> tuple[int, int]:
         if self.meta and self.meta.sizes and camera in self.meta.sizes:
@@ -97,7 +88,7 @@ class Scene:
         self.is_released = facts is not None and not (self.meta and self.meta.provenance)
         if self.meta and self.meta.times is not None:
             self.times: NDArray[np.float64] = self._checked_times("times", self.meta.times)
-            self.times_source = "scene.json"
+            self.times_source = self._source.times_source
         elif facts is not None:
             self.times = np.asarray(facts.times(self.n_frames), dtype=np.float64)
             self.times_source = "manifest"
@@ -127,24 +118,24 @@ class Scene:
 
     def image_path(self, camera: str, t: int) -> Path:
         """The image file of `camera` at timestep `t`."""
-        return self.directory / "ims" / self._paths[camera][t]
+        return self._source.image_path(camera, t)
 
     def mask_path(self, camera: str, t: int) -> Path:
-        """The liquid mask file of `camera` at timestep `t`."""
-        return self.directory / "seg" / Path(self._paths[camera][t]).with_suffix(".png")
+        """The file with the liquid mask of `camera` at timestep `t`; in NeuroFluid's layout it is the image's."""
+        return self._source.mask_path(camera, t)
 
     def image(self, camera: str, t: int) -> NDArray[np.uint8]:
         """sRGB uint8 [H, W, 3] of `camera` at timestep `t`."""
-        return self._sized(camera, self.image_path(camera, t), read_image(self.image_path(camera, t)))
+        return self._sized(camera, self.image_path(camera, t), self._source.image(camera, t))
 
     def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
         """Liquid mask [H, W] of `camera` at timestep `t`."""
-        return self._sized(camera, self.mask_path(camera, t), read_gray(self.mask_path(camera, t))) > 127
+        return self._sized(camera, self.mask_path(camera, t), self._source.mask(camera, t))
 
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
         """Container mask [H, W] of `camera`, or None where the scene has none."""
         path = self.directory / "container_mask" / f"{camera}.png"
-        return self._sized(camera, path, read_gray(path)) > 127 if path.is_file() else None
+        return self._sized(camera, path, read_gray(path) > 127) if path.is_file() else None
 
     def container_mesh(self) -> ContainerMesh | None:
         """The container as a mesh in scene units, or None where the scene has none.
@@ -157,7 +148,7 @@ class Scene:
         pose = self.meta.container_pose
         return mesh if pose is None else mesh.placed(pose)
 
-    def _sized(self, camera: str, path: Path, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _sized(self, camera: str, path: Path, array: Pixels) -> Pixels:
         view = self.cameras[camera]
         if array.shape[:2] != (view.height, view.width):
             raise SplashbenchError(
@@ -178,21 +169,22 @@ class Scene:
         return np.concatenate([data[:, :6], segment], axis=1).astype(np.float32)
 
     @property
-    def truth_path(self) -> Path:
-        """Where the true particles of a made-up scene lie, if there are any."""
-        return self.directory / "truth" / "particles.npz"
+    def has_truth(self) -> bool:
+        """Whether it is a made-up scene whose true particles are known."""
+        return bool(self._source.truth_files())
 
     def truth_particles(self) -> Particles | None:
         """The true particles of a made-up scene, on the scene's timesteps, or None."""
-        path = self.truth_path
-        if not path.is_file():
-            return None
-        particles = Particles.load(path)
-        if particles.n_frames != self.n_frames:
-            raise SplashbenchError(
-                f"{path} has {particles.n_frames} instants, the scene {self.n_frames}; attach it again"
-            )
-        return particles
+        return self._source.truth_particles() if self.has_truth else None
+
+    @property
+    def truth_digest(self) -> str | None:
+        """SHA-256 of the files of the true particles, or None where there are none."""
+        return self._source.truth_digest()
+
+    def faults(self) -> list[str]:
+        """What contradicts itself in files that are whole one by one, a line each."""
+        return self._source.faults()
 
     @cached_property
     def digest(self) -> str:
@@ -201,14 +193,13 @@ class Scene:
         Ground-truth particles are left out, so that attaching them does not orphan earlier submissions.
         """
         digest = hashlib.sha256()
-        names = ["train_meta.json", "test_meta.json", "scene.json"]
-        files = [self.directory / name for name in names if (self.directory / name).is_file()]
+        files = self._source.calibration_files()
         for camera in sorted(self.cameras):
             for t in range(self.n_frames):
                 files += [self.image_path(camera, t), self.mask_path(camera, t)]
-        for path in files:
+        for path in dict.fromkeys(files):
             if not path.is_file():
-                raise SplashbenchError(f"{path} is missing; restore it, or leave its frame out of the *_meta.json")
+                raise SplashbenchError(f"{path} is missing; restore it, or leave its frame out of the JSON files")
             entry = [path.relative_to(self.directory).as_posix(), sha256_file(path)]
             digest.update(json.dumps(entry).encode())
         # Without scene.json the folder's name decides both of these (Table S1), and both move the metrics.

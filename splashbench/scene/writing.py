@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ def write_scene(
     initial_points: NDArray | None = None,
     container_masks: Mapping[str, NDArray[np.bool_]] | None = None,
     image_format: str = "png",
+    shown: Collection[str] | None = None,
 ) -> None:
     """Write a scene into `directory` (made where absent; wrap in `files.atomic_directory` for all or nothing).
 
@@ -33,27 +34,29 @@ def write_scene(
         cameras: name -> Camera, of the images as written.
         train, test: camera names of the split.
         n_frames: number of timesteps T.
-        frames: yields (camera, t, image uint8 [H, W, 3], liquid mask [H, W]) once for each camera and timestep.
+        frames: yields (camera, t, image uint8 [H, W, 3], liquid mask [H, W]) once for each shown camera and timestep.
         meta: scene.json; its `sizes` are filled in here.
         initial_points: [N, 7] x, y, z, r, g, b, seg, for init_pt_cld.npz.
         container_masks: name -> [H, W].
         image_format: "png" (lossless) or "jpg".
+        shown: the cameras whose images are written; of the others only the calibration. All by default.
     """
     directory = Path(directory)
+    shown = set(cameras if shown is None else shown)
     directory.mkdir(parents=True, exist_ok=True)
     for folder in ("ims", "seg"):
-        for name in cameras:
+        for name in shown:
             (directory / folder / name).mkdir(parents=True, exist_ok=True)
     written: set[tuple[str, int]] = set()
-    for name, t, image, mask in track(frames, "writing the scene", total=n_frames * len(cameras)):
+    for name, t, image, mask in track(frames, "writing the scene", total=n_frames * len(shown)):
         camera = cameras[name]
         if image.shape != (camera.height, camera.width, 3) or mask.shape != (camera.height, camera.width):
             raise ValueError(f"camera {name}, frame {t}: image {image.shape} or mask {mask.shape} is not {camera}")
         write_image(directory / "ims" / name / f"{t:06d}.{image_format}", image)
         write_png(directory / "seg" / name / f"{t:06d}.png", _to_gray(mask))
         written.add((name, t))
-    if len(written) != n_frames * len(cameras):
-        raise ValueError(f"{len(written)} of {n_frames * len(cameras)} images were given")
+    if len(written) != n_frames * len(shown):
+        raise ValueError(f"{len(written)} of {n_frames * len(shown)} images were given")
     for name, mask in (container_masks or {}).items():
         write_png(directory / "container_mask" / f"{name}.png", _to_gray(mask))
     if initial_points is not None:

@@ -16,7 +16,6 @@ from typing import Any
 
 from splashbench import progress
 from splashbench.errors import SplashbenchError
-from splashbench.files import sha256_file
 from splashbench.scene import Scene
 from splashbench.score.ground_truth import score_ground_truth
 from splashbench.score.lpips import load_lpips
@@ -82,6 +81,7 @@ def score_submission(
         settings=identity.settings,
         control=identity.control,
         mixed=identity.mixed,
+        withheld=identity.withheld,
         status=status,
         reason=submission.reason,
         protocol=protocol,
@@ -91,7 +91,7 @@ def score_submission(
             protocol=protocol.digest,
             reference=reference.digest if reference is not None else None,
             lpips_weights=weights_digest,
-            truth=sha256_file(scene.truth_path) if scene.truth_path.is_file() else None,
+            truth=scene.truth_digest,
         ),
         metrics={name: metrics[name] for name in METRICS},
         claimed={name: value for name, value in identity.claimed.items() if math.isfinite(value)},

@@ -71,6 +71,7 @@ class Result(_Frozen):
     settings: dict[str, Any] = Field(default_factory=dict)
     control: bool = False
     mixed: bool = False
+    withheld: str | None = None
     status: str
     reason: str = ""
     protocol: Protocol
@@ -85,6 +86,11 @@ class Result(_Frozen):
         """The value of metric `name`, or None."""
         metric = self.metrics.get(name)
         return metric.value if metric else None
+
+    @property
+    def protocol_label(self) -> str:
+        """What results must share to be compared: the protocol, and whether timesteps were withheld."""
+        return f"{self.protocol.label}, {self.withheld} timesteps withheld" if self.withheld else self.protocol.label
 
     @property
     def file_name(self) -> str:

@@ -19,6 +19,7 @@ from splashbench.score.result import MetricValue, ViewValues, metric_value
 from splashbench.score.settings import Protocol
 from splashbench.score.silhouette import iou, spill, spill_rgb
 from splashbench.score.temporal import JitterError
+from splashbench.submission.withheld import scored_timesteps
 
 Track = Callable[[Iterable[int], str], Iterator[int]]
 
@@ -41,7 +42,11 @@ def score_views(
     Args:
         submission, reference: give `rendering(camera, t)` and `alpha(camera, t)`; reference is the control `nothing`.
         lpips: the metric, or None for the reason `no_lpips`.
+
+    Where the submission withheld timesteps from its method, those alone count, but for the jitter error, which is of
+    the whole sequence.
     """
+    scored = set(scored_timesteps(scene.n_frames, submission.identity.withheld))
     per_view: dict[str, dict[str, list[float | None]]] = {name: {} for name in _PER_FRAME}
     jitter: dict[str, float | None] = {}
     for camera in scene.test:
@@ -50,10 +55,11 @@ def score_views(
         for t in track(range(scene.n_frames), f"scoring view {camera}"):
             rows.append(_score_frame(scene, submission, reference, lpips, protocol, camera, t, jitter_error))
         for name in _PER_FRAME:
-            per_view[name][camera] = [row.get(name) for row in rows]
+            per_view[name][camera] = [row.get(name) if t in scored else None for t, row in enumerate(rows)]
         jitter[camera] = jitter_error.value()
     few = f"no test view has a frame with {protocol.min_mask_pixels} mask pixels"
-    values = {name: _averaged(name, views, few) for name, views in per_view.items()}
+    left_out = (scene.n_frames - len(scored)) * len(scene.test)
+    values = {name: _averaged(name, views, few, left_out) for name, views in per_view.items()}
     values["jitter_error"] = _jitter_value(jitter)
     if reference is None:
         values |= {name: metric_value(name, None, _NO_REFERENCE) for name in _NEEDS_REFERENCE}
@@ -116,10 +122,13 @@ def _checked(array: NDArray, camera: Camera, t: int, what: str) -> NDArray:
     return array
 
 
-def _averaged(name: str, views: dict[str, list[float | None]], reason: str) -> MetricValue:
-    """Mean over each view's frames that have a value, then over the views that have one."""
+def _averaged(name: str, views: dict[str, list[float | None]], reason: str, left_out: int) -> MetricValue:
+    """Mean over each view's frames that have a value, then over the views that have one.
+
+    left_out: frames of all views that were not to be scored, which are not skipped ones.
+    """
     detailed = {camera: ViewValues(value=_mean(frames), frames=tuple(frames)) for camera, frames in views.items()}
-    skipped = sum(frame is None for frames in views.values() for frame in frames)
+    skipped = sum(frame is None for frames in views.values() for frame in frames) - left_out
     value = _mean([view.value for view in detailed.values()])
     return metric_value(name, value, reason, skipped_frames=skipped, views=detailed)
 

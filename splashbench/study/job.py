@@ -148,6 +148,7 @@ def _scored(job: Job, store: Store, entry: Entry) -> Entry:
         keep_model=job.keep,
         replace=True,
         cache=store.cache / "parts",
+        withheld=job.variant.withheld,
     )
     if job.is_reference:
         reference = submission if submission.status == Status.OK else None

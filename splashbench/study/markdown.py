@@ -53,7 +53,7 @@ def _facts(table: Table) -> str:
     shared = any(run.entry and run.entry.record and run.entry.record.reused for run in table.runs)
     lines = [
         f"Method: {plan.method.id} (version {plan.method.version}), preset {plan.preset}",
-        f"Settings of every row, the budget: {_one_line(budget)}",
+        f"Settings of every row of it, the budget: {_one_line(budget)}",
         f"Seeds: {', '.join(map(str, plan.spec.seeds))}",
         f"Runs: {ok} ok, {failed} failed" + (f", {waiting} not run yet" if waiting else ""),
     ]
@@ -129,12 +129,15 @@ def _variants(table: Table) -> str:
         first = row.runs[0].planned
         variant = first.variant
         settings = first.overrides if row.control else variant.settings
+        method = f"{first.method} " if variant.method else ""
         changed = [f"{step.kind} {_amount(step.model_dump())}" for step in variant.perturbation]
         if variant.train_views is not None:
             views = dict.fromkeys(" ".join(run.entry.train_views) for run in row.runs if run.entry)
             changed.append(f"training views {' / '.join(view for view in views if view) or variant.train_views}")
+        if variant.withheld:
+            changed.append(f"{variant.withheld} timesteps withheld")
         said = ", ".join(f"{key} = {value}" for key, value in settings.items())
-        lines.append([_title(row), first.preset, said or NONE, ", ".join(changed) or NONE, row.note or NONE])
+        lines.append([_title(row), method + first.preset, said or NONE, ", ".join(changed) or NONE, row.note or NONE])
     return _joined(lines)
 
 

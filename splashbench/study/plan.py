@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from splashbench.adapter.contract import Method
 from splashbench.adapter.discovery import load_method
@@ -76,38 +76,56 @@ def make_plan(spec: StudySpec) -> Plan:
 
     Raises SplashbenchError, one line, for a missing scene, an unknown method, preset or setting.
     """
-    method = load_method(spec.method)
-    if spec.device not in method.devices:
-        known = ", ".join(method.devices)
-        raise SplashbenchError(f"study {spec.name}: method {method.id} runs on {known}, not on {spec.device!r}")
-    preset = spec.preset or next(iter(method.Config.presets))
+    rows = {variant.name: _row(spec, variant) for variant in spec.variants}
     scenes = _open_scenes(spec)
     timing = TIMING_FRAMES if "render_fps" in spec.metrics else 0
     references: dict[str, Planned] = {}
     runs: list[Planned] = []
-    settings = {v.name: _checked(spec, method, v.name, v.preset or preset, v.settings) for v in spec.variants}
     for seed in spec.seeds:
         for scene in scenes:
             for variant in spec.variants:
                 reference = _reference(spec, scene, variant, seed, timing)
                 if reference:
                     references.setdefault(reference.digest, reference)
-                overrides, resolved = settings[variant.name]
-                chosen = variant.preset or preset
+                row = rows[variant.name]
                 runs.append(
                     Planned(
                         scene,
                         variant,
                         seed,
-                        _digest(method, chosen, resolved, seed, spec.device, scene.scene, variant),
-                        spec.method,
-                        chosen,
-                        overrides,
+                        _digest(row.method, row.preset, row.resolved, seed, spec.device, scene.scene, variant),
+                        row.name,
+                        row.preset,
+                        row.overrides,
                         reference.digest if reference else None,
                         timing,
                     )
                 )
-    return Plan(spec, method, preset, scenes, tuple(references.values()), tuple(runs))
+    own = load_method(spec.method)
+    preset = spec.preset or next(iter(own.Config.presets))
+    return Plan(spec, own, preset, scenes, tuple(references.values()), tuple(runs))
+
+
+class _Row(NamedTuple):
+    """What a variant runs: a method under the name it was given, its preset, what is set on it, and all settings."""
+
+    method: Method
+    name: str
+    preset: str
+    overrides: dict[str, Any]
+    resolved: dict[str, Any]
+
+
+def _row(spec: StudySpec, variant: Variant) -> _Row:
+    name = variant.method or spec.method
+    method = load_method(name)
+    if spec.device not in method.devices:
+        known = ", ".join(method.devices)
+        raise SplashbenchError(f"study {spec.name}: method {method.id} runs on {known}, not on {spec.device!r}")
+    own = variant.method is None
+    preset = variant.preset or (spec.preset if own else None) or next(iter(method.Config.presets))
+    overrides, resolved = _checked(spec, method, variant.name, preset, variant.settings, with_base=own)
+    return _Row(method, name, preset, overrides, resolved)
 
 
 def _open_scenes(spec: StudySpec) -> tuple[Named, ...]:
@@ -162,4 +180,6 @@ def _digest(
         "scene": [scene.digest, changes(scene, variant, seed)],
         "protocol": PROTOCOL_V1.digest,
     }
+    if variant.withheld:  # said only where it is so: the digests of other runs stay
+        said["withheld"] = variant.withheld
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

@@ -18,7 +18,10 @@ import numpy as np
 from splashbench.adapter.reuse import alone
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
-from splashbench.scene import Scene
+from splashbench.scene import Scene, SceneMeta, write_scene
+from splashbench.scene.container import mesh_path
+from splashbench.scene.layout import plain_name
+from splashbench.scene.source import ReleasedSource
 from splashbench.study.perturb import Perturbation, direction_of_loss, without_part
 from splashbench.study.spec import Variant
 from splashbench.study.views import nested_views
@@ -70,8 +73,11 @@ def changed_scene(scene: Scene, variant: Variant, seed: int, cache: Path) -> Sce
 
 
 def _copy(scene: Scene, train: list[str], directory: Path) -> None:
-    """A copy of `scene` with the training views `train` only."""
+    """A copy of `scene` with the training views `train` only, in the released layout."""
     kept = [*train, *scene.test]
+    if scene.layout != ReleasedSource.layout:
+        _convert(scene, train, kept, directory)
+        return
     gone = set(scene.cameras) - set(kept)
     for root, folders, names in os.walk(scene.directory):
         folders.sort()
@@ -87,12 +93,37 @@ def _copy(scene: Scene, train: list[str], directory: Path) -> None:
     # Written as new files: the links go, and with them the way back to the scene's own.
     write_json(directory / "train_meta.json", meta)
     if scene.meta is not None:
-        subsets = {
-            key: {name: value for name, value in known.items() if name in kept}
-            for key in ("sizes", "camera_times")
-            if (known := getattr(scene.meta, key)) is not None
-        }
-        write_model(directory / "scene.json", scene.meta.model_copy(update=subsets))
+        write_model(directory / "scene.json", _meta_of(scene.meta, kept))
+
+
+def _meta_of(meta: SceneMeta, kept: list[str]) -> SceneMeta:
+    """`meta` with the entries of the cameras `kept` alone."""
+    subsets = {
+        key: {name: value for name, value in known.items() if name in kept}
+        for key in ("sizes", "camera_times")
+        if (known := getattr(meta, key)) is not None
+    }
+    return meta.model_copy(update=subsets)
+
+
+def _convert(scene: Scene, train: list[str], kept: list[str], directory: Path) -> None:
+    """Write what `_copy` links, of a scene in another layout."""
+    pairs = ((name, t) for name in kept for t in range(scene.n_frames))
+    write_scene(
+        directory,
+        cameras={name: scene.cameras[name] for name in kept},
+        train=train,
+        test=scene.test,
+        n_frames=scene.n_frames,
+        frames=((name, t, scene.image(name, t), scene.mask(name, t)) for name, t in pairs),
+        meta=_meta_of(scene.meta or SceneMeta(name=plain_name(scene.name)), kept),
+        initial_points=scene.initial_points(),
+    )
+    if scene.meta is not None and scene.meta.container_mesh is not None:
+        _link(mesh_path(scene.directory, scene.meta.container_mesh), directory / scene.meta.container_mesh)
+    true = scene.truth_particles()
+    if true is not None:
+        true.save(directory / "truth" / "particles.npz")
 
 
 def _link(source: Path, target: Path) -> None:

@@ -18,6 +18,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import validate_model
 from splashbench.score.metrics import METRICS, Metric
 from splashbench.study.perturb import Perturbation
+from splashbench.submission.withheld import Withheld
 
 #: Metrics that follow from others, tabulated here alone: sigma_D over mu_D is what the paper's Table S7 gives.
 DERIVED: dict[str, tuple[Metric, str, str]] = {
@@ -44,15 +45,20 @@ class SceneEntry(_Model):
 class Variant(_Model):
     """One row of the table: what it changes. `paper`: its name in leaderboards/paper.csv.
 
+    method: another one than the study's, with its own preset (the first, unless named) and settings; `base` is not its.
+
     train_views: a number (nested subsets that bracket the test views) or the names of the training views kept.
+    withheld: timesteps that the method does not see, and that alone are scored (submission/withheld.py).
     """
 
     name: str = Field(pattern=_NAME)
     note: str = ""
+    method: str | None = None
     preset: str | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     perturbation: tuple[Perturbation, ...] = ()
     train_views: Annotated[int, Field(ge=2)] | tuple[str, ...] | None = None
+    withheld: Withheld | None = None
     paper: str | None = None
 
 
@@ -71,7 +77,7 @@ class Paper(_Model):
 
 
 class StudySpec(_Model):
-    """A whole study. `base`: settings of every row, on top of its preset: the budget, stated once.
+    """A whole study. `base`: settings of every row of `method`, on top of its preset: the budget, stated once.
 
     reference: false in TOML leaves the control out. timeout_seconds: for each fit, and again for each rendering.
     """

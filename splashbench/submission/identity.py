@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from splashbench.submission.withheld import Withheld
+
 PROTOCOL: Literal["v1"] = "v1"
 _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 
@@ -45,6 +47,8 @@ class Identity(BaseModel):
     scene_digest: str = Field(pattern=r"^[0-9a-f]{64}$")
     control: bool = False
     mixed: bool = False
+    #: Timesteps that the method did not see; only they are scored (withheld.py).
+    withheld: Withheld | None = None
     splashbench_version: str = ""
     hardware: dict[str, Any] = Field(default_factory=dict)
     #: What the submitter says the figures are; shown beside the verified ones, never instead of them.

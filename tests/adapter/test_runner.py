@@ -51,6 +51,12 @@ def test_views_are_rendered_when_their_photographs_were_taken(tmp_path: Path) ->
             np.testing.assert_allclose(submission.rendering(name, t)[..., 2] / 255, scene.times[t] + delay, atol=2e-3)
 
 
+def test_a_folder_without_scene_json_may_have_any_name(balls_copy: Path, tmp_path: Path) -> None:
+    (balls_copy / "scene.json").unlink()
+    submission = _run("Good", balls_copy.rename(tmp_path / "my balls (2)"), tmp_path / "out")
+    assert (submission.status, submission.identity.scene) == (Status.OK, "my balls (2)")
+
+
 @pytest.mark.parametrize(
     ("name", "status", "reason"),
     [

@@ -6,6 +6,7 @@ from splashbench.adapter.discovery import registered
 from splashbench.conformance import Report, conform
 from splashbench.conformance.checks import CHECKS
 
+_SPARSE = {"iterations": 20, "static_points": 300}
 #: Small enough for a test; on top of preset quick.
 SETTINGS: dict[str, dict[str, object]] = {
     "hull_points": {},
@@ -13,6 +14,16 @@ SETTINGS: dict[str, dict[str, object]] = {
     "nothing": {"iterations": 20, "anchors": 300},
     "scaffold_gs": {"iterations": 20, "anchors": 300},
     "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
+    "deformable_3dgs": {
+        "iterations": 20,
+        "static_points": 300,
+        "hull_points": 200,
+        "most": 700,
+        "width": 16,
+        "depth": 4,
+    },
+    "spacetime_gaussians": {**_SPARSE, "hull_points": 400, "most": 1500},
+    "spacetime_gaussians_lite": {**_SPARSE, "hull_points": 400, "most": 1500},
 }
 # A dozen starts of PyTorch, three of them to be stopped, are for `make test-all`.
 _STARTS = {"time_limit", "signals", "processes", "one_frame", "no_liquid", "other_seed"}
@@ -39,6 +50,6 @@ def test_controls_keep_the_contract(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nearest_camera", "nothing", "scaffold_gs", "splashsplat"])
+@pytest.mark.parametrize("name", sorted(set(SETTINGS) - {"hull_points"}))
 def test_every_method_keeps_all_of_the_contract(name: str) -> None:
     assert faults(conform(name, overrides=SETTINGS[name])) == {}

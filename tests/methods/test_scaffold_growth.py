@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
+from splashbench_methods.gaussian_splatting.screen import screen_gradients
 from splashbench_methods.scaffold_gs import BackgroundSettings
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed, sparse_anchors
 from splashbench_methods.scaffold_gs.fitting import fit_model
-from splashbench_methods.scaffold_gs.growth import Growth, screen_gradients
+from splashbench_methods.scaffold_gs.growth import Growth
 from splashbench_methods.scaffold_gs.model import AnchorModel, Gaussians, Variant
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 from splashbench_methods.scaffold_gs.plate import Plate

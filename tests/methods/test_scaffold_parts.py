@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from splashbench_methods.gaussian_splatting.losses import l1
+from splashbench_methods.gaussian_splatting.splats import rotation_matrices
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench_methods.scaffold_gs.depth import depth_maps, look_at
 from splashbench_methods.scaffold_gs.fitting import pyramid
-from splashbench_methods.scaffold_gs.losses import l1
-from splashbench_methods.scaffold_gs.model import AnchorModel, Variant, rotation_matrices
+from splashbench_methods.scaffold_gs.model import AnchorModel, Variant
 from splashbench_methods.scaffold_gs.plate import Plate, make_plate, masked_median
 
 from splashbench.scene import Camera
@@ -262,11 +263,11 @@ class TestLoss:
         seen[5, 5] = True
         plate = self.plate(seen)
         image = torch.rand(14, 17, 3, generator=torch.Generator().manual_seed(0), requires_grad=True)
-        loss = l1(image, plate)
+        loss = l1(image, plate.image, plate.seen)
         loss.backward()
         assert loss.item() == pytest.approx((image[5, 5] - torch.tensor(plate.floats()[5, 5])).abs().mean().item())
         assert torch.count_nonzero(image.grad) == torch.count_nonzero(image.grad[5, 5]) == 3
-        assert l1(image, self.plate(np.zeros((14, 17), bool))).item() == 0
+        assert l1(image, np.zeros((14, 17, 3), np.uint8), np.zeros((14, 17), bool)).item() == 0
 
     def test_value_and_gradient_are_those_of_torch(self):
         plate = self.plate(np.random.default_rng(1).random((70, 31)) < 0.5)
@@ -274,7 +275,7 @@ class TestLoss:
         target, seen = torch.tensor(plate.floats()), torch.tensor(plate.seen)
         expected = (image - target).abs()[seen].mean()
         (gradient,) = torch.autograd.grad(2 * expected, image)
-        loss = l1(image, plate)
+        loss = l1(image, plate.image, plate.seen)
         (2 * loss).backward()
         assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
         np.testing.assert_allclose(image.grad, gradient, rtol=1e-5)

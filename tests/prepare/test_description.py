@@ -165,7 +165,7 @@ def test_a_session_is_described(folder: Path, capsys: pytest.CaptureFixture[str]
     assert main(["prepare", str(folder), "--init", "--square-metres", "0.03"]) == 0
     described = toml.load(folder / "session.toml")
     assert (described["train"], described["test"]) == (["cam1", "cam2"], ["cam3"])
-    assert described["board"]["squares_x"], described["board"]["squares_y"] == (8, 5)
+    assert (described["board"]["squares_x"], described["board"]["squares_y"]) == (8, 5)
     assert described["board"]["marker_metres"] == pytest.approx(0.0225, rel=0.06)
     assert described["recordings"]["pour"]["cam2"] == ["cam2/GX010003.MP4"]
     assert "no handheld sweep" in capsys.readouterr().err

@@ -218,7 +218,7 @@ def test_nothing_for_up_and_nothing_for_metres_are_one_line_each() -> None:
 
 
 def test_a_container_of_known_size_gives_metres_where_nothing_else_does() -> None:
-    upright = Upright(SFM.rotation @ [0.0, 3.0, 0.0], SFM.apply(np.zeros((1, 3)))[0], None, 1 / SFM.scale)
+    upright = Upright(SFM.rotation @ [0.0, 3.0, 0.0], SFM.apply(np.zeros((1, 3)))[0], 1 / SFM.scale)
     frame = choose_frame(None, None, None, upright)
     assert (frame.scale_source, frame.up_source) == ("container", "container")
     assert frame.scene_from_sfm.scale * SFM.scale == pytest.approx(1)
@@ -268,8 +268,8 @@ def test_a_frame_needs_a_direction() -> None:
         scene_frame(Upright(np.zeros(3), np.zeros(3)), 1.0)
 
 
-def test_the_wished_direction_becomes_x() -> None:
-    frame = scene_frame(Upright(np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([1.0, 1.0, 5.0])), 2.0)
-    np.testing.assert_allclose(frame.rotation @ [0, 0, 1], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(frame.rotation @ (np.array([1, 1, 0]) / np.sqrt(2)), [1, 0, 0], atol=1e-12)
+def test_up_becomes_y_and_the_frame_is_right_handed() -> None:
+    frame = scene_frame(Upright(np.array([1.0, 0.0, 2.0]), np.zeros(3)), 2.0)
+    np.testing.assert_allclose(frame.rotation @ np.array([1, 0, 2]) / np.sqrt(5), [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(frame.rotation @ frame.rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(frame.rotation) == pytest.approx(1)

@@ -135,7 +135,6 @@ def edit(*keys: str, value: Any = None) -> Callable[[dict[str, Any]], None]:
             "at least 4 squares each way; count squares, not inner corners",
         ),
         (edit("board", "colour", value="red"), r"board\.colour"),
-        (edit("marker", value={"dictionary": "DICT_4X4_50", "id": 19, "metres": 0.1}), "19 is also on the board"),
         (edit("marker", value={"dictionary": "DICT_4X4_50", "id": 30, "metres": 0.0}), r"marker\.metres"),
         (edit("distance", value={"cameras": ["1", "9"], "metres": 1.3}), r"\[distance\] names camera 9"),
         (edit("distance", value={"cameras": ["1", "1"], "metres": 1.3}), "two different cameras"),

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from splashbench.cli import prepare as cli_prepare
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardView
 from splashbench.prepare.calibration.intrinsics import Calibration
@@ -230,6 +231,11 @@ def test_a_file_that_went_missing_or_changed_is_made_anew(store: StageStore) -> 
         store.files("masks", int, {}, make, part="1")
         assert [(folder / name).read_text() for name in "ab"] == ["a", "b"]
     store.files("masks", int, {}, lambda _: pytest.fail("nothing was spoilt"), part="1")
+
+
+def test_the_command_line_names_the_same_stages() -> None:
+    """It repeats them, so that its --help need not import this."""
+    assert cli_prepare._STAGES == STAGES
 
 
 def test_time_is_counted_for_what_was_done(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from splashbench.prepare.film.video import open_media
 from splashbench.prepare.sound.audio import join_audio
 from splashbench.prepare.sound.sync import (
     ClockFit,
-    correct_for_sound_paths,
     estimate_sync,
     require_synced,
     sequence_sync_rms,
+    shifted,
+    sound_paths,
     track_status,
 )
 
@@ -241,7 +242,7 @@ def test_sound_paths_are_taken_out_once_positions_are_known() -> None:
         for name, at in positions.items()
     }
     raw = estimate_sync(audio, RATE, "1")
-    corrected = correct_for_sound_paths(raw, positions, [0.0, 0.0, 0.0], "1")
+    corrected = shifted(raw, sound_paths(positions, [0.0, 0.0, 0.0], "1")[1])
     assert worst_error(raw["2"], 0.31, 1.0, 6) > 1.5e-3
     for name, start in starts.items():
         assert worst_error(corrected[name], start, 1.0, 6) < 0.1e-3

@@ -13,7 +13,7 @@ from scipy import signal
 
 from splashbench.prepare.film.video import open_media
 from splashbench.prepare.sound.audio import join_audio
-from splashbench.prepare.sound.sync import ClockFit, correct_for_sound_paths, estimate_sync
+from splashbench.prepare.sound.sync import ClockFit, estimate_sync, shifted, sound_paths
 
 pytestmark = pytest.mark.slow
 
@@ -120,7 +120,7 @@ def test_sound_paths_of_up_to_two_metres(tmp_path: Path) -> None:
         for camera in CLOCKS
     }
     raw = estimate_sync(audio, RATE, "1")
-    corrected = correct_for_sound_paths(raw, positions, place, "1")
+    corrected = shifted(raw, sound_paths(positions, place, "1")[1])
     before, after = errors(raw)[0], errors(corrected)[0]
     print(f"before {before * 1e3:.3f} ms, after {after * 1e3:.4f} ms")
     assert before > 5e-3

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from splashbench.observe.consistency import inside_mask
 from splashbench.scene import Camera, Particles
 from splashbench.score.density import frame_density, poly6_densities
 from splashbench.score.energy import energy_deviation
-from splashbench.score.mixed import inside_mask
 from splashbench.score.settings import Protocol
 from splashbench.score.uniformity import frame_uniformity, shell_points
 

@@ -9,9 +9,10 @@ import pytest
 from splashbench.adapter.oracle import write_oracle
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
+from splashbench.observe.consistency import inside_mask
 from splashbench.scene import Particles, Scene
 from splashbench.score import METRICS, PROTOCOL_V1, Protocol, Result, score_submission, shared_fields
-from splashbench.score.mixed import inside_mask, liquid_of_mixed
+from splashbench.score.mixed import liquid_of_mixed
 from splashbench.synth.balls import ball_centers
 
 NAMES = [

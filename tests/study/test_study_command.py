@@ -227,6 +227,7 @@ def _raising(arguments: list[str]) -> None:
         ),
         ({"variants": [{"name": "full", "train_views": 9}]}, [], "has 5 training views, not 9"),
         ({"method": "splashspat"}, [], "did you mean 'splashsplat'?"),
+        ({"variants": [{"name": "full", "method": "nothin"}]}, [], "did you mean 'nothing'?"),
         ({}, ["--only", "drak"], "has no variant 'drak', did you mean 'dark'?"),
         ({}, ["--set", "gray=1"], "setting gray: Extra inputs"),
         ({}, ["--scenes", "nowhere"], "nowhere is not a folder"),
@@ -263,7 +264,24 @@ def test_an_unknown_study_is_told_with_those_there_are() -> None:
         load_spec("ablations")
 
 
-@pytest.mark.parametrize("name", ["ablation", "masks", "views", "sensitivity", "best"])
+def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -> None:
+    spec = _spec(
+        balls_directory,
+        seeds=[0],
+        base={"wobble": 0.1},
+        variants=[{"name": "full"}, {"name": "photograph", "method": "nearest_camera"}],
+    )
+    out = tmp_path / "out"
+    assert main(["study", "ablate", _write(tmp_path, spec), str(out)]) == 0
+    rows = {row["variant"]: row["figures"] for row in _table(out)["rows"]}
+    assert rows["photograph"]["psnr"]["mean"] != rows["full"]["psnr"]["mean"]
+    results = {source.result.method: source.result for source in load_results(out / "results")}
+    assert results["nearest_camera"].settings == {}  # the budget is of the study's own method
+    assert results["grey"].settings["wobble"] == 0.1
+    assert "nearest_camera" in (out / "table.md").read_text()
+
+
+@pytest.mark.parametrize("name", ["ablation", "masks", "views", "sensitivity", "best", "baselines", "interpolation"])
 def test_the_shipped_studies_fit_the_method(name: str, balls_directory: Path) -> None:
     assert name in shipped()
     plan = make_plan(load_spec(name, scenes=[str(balls_directory)]))

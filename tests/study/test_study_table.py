@@ -139,7 +139,7 @@ def test_markdown_says_what_was_run_and_what_came_of_it(table: Table) -> None:
     for line in (
         "# Study greys: Greys | compared",
         COMMAND,
-        "- Settings of every row, the budget: wobble = 0.01",
+        "- Settings of every row of it, the budget: wobble = 0.01",
         "- Seeds: 0, 1, 2",
         "- Runs: 17 ok, 1 failed",
         "- ΔE: over b only",

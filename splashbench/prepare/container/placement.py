@@ -1,9 +1,8 @@
 """Placing the scanned container into the scene by its masks, and gravity from how it stands.
 
 The paper aligns the cleaned meshes with the capture by hand and verifies them by projecting them into the calibrated
-images (Sec. S1.3); here the silhouettes decide (`silhouette_alignment`). Only the cameras that are handed over take
-part, so that held-out views can verify (`container_check`) what they did not decide. Clicked points are in
-`container_points`.
+images (Sec. S1.3); here the silhouettes decide (`alignment`). Only the cameras that are handed over take part, so that
+held-out views can verify (`check`) what they did not decide. Clicked points are in `points`.
 
 What silhouettes cannot tell is settled by rule and said: a bowl may be turned about its axis at will, a box by half a
 turn, and a closed box may stand on its head.
@@ -80,7 +79,7 @@ class Placement:
             of them that look the same) or is "free" (it looks the same however turned).
         equivalent_turns: 1 where determined, 0 where free.
         cameras: those that decided.
-        projections: per camera that decided, overlap and distance of the outlines (see `container_check`).
+        projections: per camera that decided, overlap and distance of the outlines (see `check`).
         cost_px: RMS distance of the outlines (of the clicked points) over all of `cameras`, occluded parts counted no
             further than the fit's reach; pixels of the image, or where a mask is longer than 1000 of them, of the
             image reduced to that.

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.undistort import Undistorter
-from splashbench.prepare.container.check import Projection, overlay, verify
+from splashbench.prepare.container.check import Projection, verify
 from splashbench.prepare.container.placement import Placement, place_by_silhouettes, up_from_container
 from splashbench.prepare.container.points import Click, place_by_points
 from splashbench.prepare.masks.provider import Mask, read_raw_mask
@@ -23,7 +22,7 @@ from splashbench.prepare.posing.metric import GRAVITY
 from splashbench.prepare.posing.scale import Upright
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.scene.camera import Camera
-from splashbench.scene.container import ContainerMesh, read_mesh
+from splashbench.scene.container import ContainerMesh
 
 
 @dataclass(frozen=True)
@@ -73,32 +72,34 @@ def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
 
 
 def place_container(
-    session: Session, cameras: Sequence[Camera], masks: Mapping[str, Mask], undistorters: Mapping[str, Undistorter]
+    session: Session,
+    mesh: ContainerMesh,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
 ) -> PlacedContainer:
-    """Place the mesh of the session's [container]; `cameras` and `masks` [H, W] are undistorted and uncropped.
+    """Place the `mesh` of the session's [container]; `cameras` and `masks` [H, W] are undistorted and uncropped.
 
     Raises SplashbenchError where masks or points do not determine a place.
     """
     assert session.container is not None
-    placement = _place(session, cameras, masks, undistorters, GRAVITY, session.container.scale)
-    return PlacedContainer(placement, verify(container_mesh(session), placement.pose, cameras, masks))
+    placement = _place(session, mesh, cameras, masks, undistorters, GRAVITY, session.container.scale)
+    return PlacedContainer(placement, verify(mesh, placement.pose, cameras, masks))
 
 
 def _place(
     session: Session,
+    mesh: ContainerMesh,
     cameras: Sequence[Camera],
     masks: Mapping[str, Mask],
     undistorters: Mapping[str, Undistorter],
     gravity: tuple[float, float, float] | None,
     metres_per_unit: float | None,
 ) -> Placement:
-    described, path = session.container, session.container_mesh
+    described = session.container
     assert described is not None
-    assert path is not None
-    mesh = read_mesh(path)
     training = [camera for camera in cameras if camera.name in session.train]
     seen = {camera.name: masks[camera.name] for camera in training if camera.name in masks}
-    source = str(session.container_folder or path)
     placement: Placement | None = None
     if described.points:
         placement = place_by_points(
@@ -119,26 +120,27 @@ def _place(
             metres_per_unit=metres_per_unit,
             gravity=gravity,
             initial=None if placement is None else placement.pose,
-            source=source,
+            source=str(session.container_folder),
         )
-    if placement is None:
-        raise SplashbenchError(
-            f"{source}: no mask of a training camera, named <camera>.png; give some, or points under [container]"
-        )
+    assert placement is not None  # `check_masks` found points or masks
     return placement
 
 
 def upright_container(
-    session: Session, cameras: Sequence[Camera], masks: Mapping[str, Mask], undistorters: Mapping[str, Undistorter]
+    session: Session,
+    mesh: ContainerMesh,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
 ) -> Upright:
     """Which way is up, and the metres, from the container in a reconstruction without either: for a session that has
     neither a flat board nor a marker. `cameras` in structure from motion's own frame."""
     described = session.container
     assert described is not None
-    placement = _place(session, cameras, masks, undistorters, gravity=None, metres_per_unit=None)
+    placement = _place(session, mesh, cameras, masks, undistorters, gravity=None, metres_per_unit=None)
     # Structure from motion's units per unit of the mesh were found; the mesh's own metres are known, or not.
     known = None if described.scale is None else described.scale / placement.scale
-    return Upright(np.asarray(up_from_container(placement)), placement.pose[:3, 3], None, known)
+    return Upright(np.asarray(up_from_container(placement)), placement.pose[:3, 3], known)
 
 
 def _pinhole_pixels(
@@ -166,21 +168,8 @@ def put_into_scene(session: Session, directory: Path) -> None:
     shutil.copyfile(path, directory / name_in_scene(path))
 
 
-def container_mesh(session: Session) -> ContainerMesh:
-    """The session's mesh in its own coordinates."""
-    assert session.container_mesh is not None
-    return read_mesh(session.container_mesh)
-
-
 def container_files(session: Session) -> list[Path]:
     """The files that a placement is made from."""
     files = [] if session.container_mesh is None else [session.container_mesh]
     folder = session.container_folder
     return [*files, *(sorted(folder.glob("*.png")) if folder is not None else [])]
-
-
-def overlay_image(
-    mesh: ContainerMesh, placed: PlacedContainer, camera: Camera, mask: Mask | None, image: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
-    """The placed mesh's outline on an undistorted frame [H, W, 3] and on its container mask, for the report."""
-    return overlay(mesh, placed.placement.pose, camera, mask, image, width=min(480, camera.width))

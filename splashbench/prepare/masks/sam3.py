@@ -89,7 +89,7 @@ class Sam3Masks:
             "confidence": self._confidence,
             "checkpoint": facts_of([self._checkpoint.folder]),
             "device": self._checkpoint.device,
-            "transformers": importlib.metadata.version("transformers"),
+            **{name: importlib.metadata.version(name) for name in ("torch", "transformers")},
         }
 
     def masks(self, camera: str, indices: Sequence[int]) -> Iterator[tuple[int, Mask]]:

@@ -43,15 +43,9 @@ class SheetCell:
     fault: str = ""
 
 
-def small_cell(image: NDArray[np.uint8], mask: Mask, fault: str = "", width: int = 2 * CELL_WIDTH) -> SheetCell:
-    """A cell of an image [H, W, 3] and its mask [H, W], shrunk to at most `width` pixels across."""
-    import cv2
-
-    scale = min(1.0, width / image.shape[1])
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-    shrunk = np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)) > 0
-    return SheetCell(small, shrunk, fault)
+def small_cell(image: NDArray[np.uint8], mask: Mask, fault: str = "") -> SheetCell:
+    """A cell of an image [H, W, 3] and its mask [H, W], shrunk to twice a cell's width at most."""
+    return SheetCell(*thumbnail(image, mask, min(2 * CELL_WIDTH, image.shape[1]), image.shape[0]), fault)
 
 
 def mask_faults(

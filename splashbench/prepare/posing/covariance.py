@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import linalg, sparse
 
+from splashbench.colmap import pycolmap
 from splashbench.prepare.calibration.lens import Array
-from splashbench.prepare.posing.colmap import pycolmap
 
 _STEP = 1e-6  # of central differences, relative to the depth or to the parameter
 # Of each model's parameters, the principal point's, which bundle adjustment does not always refine.

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.colmap import pycolmap
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.posing.colmap import pycolmap
 
 SEED = 0
 MAX_FEATURE_WIDTH = 2048  # features of larger images are sought at this size, and given in pixels of the original

@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.colmap import pycolmap
 from splashbench.prepare.calibration.lens import Array, Lens
-from splashbench.prepare.posing.colmap import pycolmap
 from splashbench.prepare.posing.covariance import PoseSigmas, pose_sigmas
 from splashbench.prepare.posing.mapping import SWEEP_FOLDER, map_images, match, quiet_colmap, refine, require_posed
 from splashbench.progress import Bar

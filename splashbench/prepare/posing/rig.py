@@ -19,7 +19,6 @@ from splashbench.prepare.film.stills import Stills, open_recording
 from splashbench.prepare.film.video import Recording
 from splashbench.prepare.posing import metric, poses, scale
 from splashbench.prepare.session import DESCRIPTION, Session
-from splashbench.progress import track
 
 Image = NDArray[np.uint8]
 
@@ -60,10 +59,6 @@ class RigRecordings:
         self.static = {camera: open_recording(session.paths("static", camera)) for camera in session.cameras}
         self.sweep = open_recording(session.sweep_paths) if session.sweep_paths else None
         self._sharpness: list[float] | None = None  # of all frames of the sweep, once they have been looked at
-
-    def calibrations(self) -> dict[str, Calibration]:
-        """Every camera's lens from its board clip."""
-        return {camera: self.calibrate(camera) for camera in track(self.session.cameras, "calibrating lenses")}
 
     def calibrate(self, camera: str) -> Calibration:
         """One camera's lens from its board clip."""
@@ -167,17 +162,6 @@ def sight_prints(
         wanted = MarkerDetector(session.marker)
         marker = metric.agreeing(_sightings(static, sweep, lenses, found, wanted.detect))
     return PosedRig(found, tuple(board), tuple(marker))
-
-
-def find_metres(
-    static: Mapping[str, Image],
-    sweep: Sequence[Image],
-    lenses: Mapping[str, Lens],
-    found: poses.Poses,
-    detector: Detector,
-) -> metric.MetricFrame:
-    """The scene frame from the board in the static pictures and in the sweep."""
-    return metric.align(_sightings(static, sweep, lenses, found, detector.detect_true), detector)
 
 
 def prints_are_seen(rig: PosedRig, session: Session, detector: Detector) -> bool:

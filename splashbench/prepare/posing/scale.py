@@ -30,13 +30,12 @@ Source = Literal["board", "marker", "distance", "container"]
 class Upright:
     """Which way is up and where the scene begins, in the frame of structure from motion.
 
-    `up`: [3], of any length; `origin`: [3]; `along`: [3], where given, the direction that becomes +x as nearly as a
-    right angle to `up` allows. `metres_per_unit`: of structure from motion, where what stands upright is of known size.
+    `up`: [3], of any length; `origin`: [3]. `metres_per_unit`: of structure from motion, where the size of what stands
+    upright is known.
     """
 
     up: Array
     origin: Array
-    along: Array | None = None
     metres_per_unit: float | None = None
 
 
@@ -78,8 +77,7 @@ def scene_frame(upright: Upright, metres_per_unit: float) -> Similarity:
     if not np.isfinite(length) or length <= 0:
         raise ValueError("up has no direction")
     y = np.asarray(upright.up, np.float64) / length
-    # Without a wish, the axis of structure from motion that is nearest to level.
-    along = np.eye(3)[np.argmin(np.abs(y))] if upright.along is None else np.asarray(upright.along, np.float64)
+    along = np.eye(3)[np.argmin(np.abs(y))]  # the axis of structure from motion that is nearest to level
     x = along - (along @ y) * y
     x /= np.linalg.norm(x)
     rotation = np.stack([x, y, np.cross(x, y)])

@@ -14,7 +14,7 @@ other being the prior of device clocks, `RATE_PRIOR_SD`: 6 s of sound give a rat
 measured rate unchanged.
 
 What is measured is arrival time. Sound takes 2.9 ms per metre, so cameras at unequal distances from the
-source are off by that much until `correct_for_sound_paths` is given their positions.
+source are off by that much until they are `shifted` by what their `sound_paths` say.
 """
 
 from __future__ import annotations
@@ -298,11 +298,3 @@ def sound_paths(
 def shifted(fits: Mapping[str, ClockFit], shift_s: Mapping[str, float]) -> dict[str, ClockFit]:
     """The clocks with `shift_s` added to their starts."""
     return {camera: replace(fit, start_s=fit.start_s + shift_s[camera]) for camera, fit in fits.items()}
-
-
-def correct_for_sound_paths(
-    fits: Mapping[str, ClockFit], positions: Mapping[str, ArrayLike], source: ArrayLike, reference: str
-) -> dict[str, ClockFit]:
-    """Take the sound's travel out of the fits, once the cameras' positions and the source's are known; see
-    `sound_paths`."""
-    return shifted(fits, sound_paths(positions, source, reference)[1])

@@ -1,4 +1,4 @@
-"""The colour loss over seen pixels, with its gradient, compiled: torch's passes over large images cost more."""
+"""The colour loss over counting pixels, with its gradient, compiled: torch's passes over large images cost more."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from splashbench_methods.scaffold_gs.plate import Plate
+from numpy.typing import NDArray
 
 from splashbench.parallel import over_range
 
@@ -41,24 +41,25 @@ def _rows(
 
 class _L1(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: torch.Tensor, plate: Plate) -> torch.Tensor:
+    def forward(ctx: Any, image: torch.Tensor, target: NDArray[np.uint8], seen: NDArray[np.bool_]) -> torch.Tensor:
         rendered = np.ascontiguousarray(image.detach().numpy())
-        scale = 1 / max(1, 3 * int(np.count_nonzero(plate.seen)))
+        scale = 1 / max(1, 3 * int(np.count_nonzero(seen)))
         totals, gradient = np.empty(len(rendered)), np.empty_like(rendered)
-        over_range(
-            _rows, len(rendered), rendered, plate.image, plate.seen, scale, totals, gradient, smallest=_SMALLEST_ROWS
-        )
+        over_range(_rows, len(rendered), rendered, target, seen, scale, totals, gradient, smallest=_SMALLEST_ROWS)
         ctx.gradient = torch.from_numpy(gradient)
         return image.new_tensor(totals.sum() * scale)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, outer: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return outer * ctx.gradient, None
+    def backward(ctx: Any, outer: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        return outer * ctx.gradient, None, None
 
 
-def l1(image: torch.Tensor, plate: Plate) -> torch.Tensor:
-    """Mean absolute difference of a float32 image [H, W, 3] in [0, 1] to a plate of its size, over its seen pixels."""
-    if image.shape != plate.image.shape:
-        raise ValueError(f"an image of {tuple(image.shape)} does not compare with a plate of {plate.image.shape}")
-    return _L1.apply(image, plate)
+def l1(image: torch.Tensor, target: NDArray[np.uint8], seen: NDArray[np.bool_]) -> torch.Tensor:
+    """Mean absolute difference of a float32 image [H, W, 3] in [0, 1] to uint8 `target`, over the pixels `seen` [H, W].
+
+    Raises ValueError where they differ in size.
+    """
+    if image.shape != target.shape or target.shape[:2] != seen.shape:
+        raise ValueError(f"an image of {tuple(image.shape)} does not compare with {target.shape} and {seen.shape}")
+    return _L1.apply(image, target, seen)

@@ -11,7 +11,7 @@ ENDED = """
 import os, signal, time
 from splashbench.processes import Terminated, terminable
 with terminable():
-    from splashbench.prepare.posing.colmap import pycolmap
+    from splashbench.colmap import pycolmap
     try:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10)
@@ -27,7 +27,7 @@ def test_a_process_that_imports_colmap_still_ends_in_good_order() -> None:
 
 
 def test_without_a_handler_of_ours_the_default_stays() -> None:
-    code = "import splashbench.prepare.posing.colmap, os, signal; os.kill(os.getpid(), signal.SIGTERM)"
+    code = "import splashbench.colmap, os, signal; os.kill(os.getpid(), signal.SIGTERM)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
     assert done.returncode == -signal.SIGTERM
     assert done.stderr == ""

@@ -1,0 +1,64 @@
+"""The deformation network: where, how turned and how large a canonical Gaussian is at a time (Yang et al., Eq. 4-5).
+
+(dx, dr, ds) = F(enc(x), enc(t)) with enc(p) = (p, sin(2^k p), cos(2^k p)) for k < L; F has ReLU layers of one width,
+gets its input a second time after half of them, and three linear heads.
+
+The octaves suit positions within about +-1.3: positions are first brought there, and what comes out is scaled back, so
+that a scene's units do not matter.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+OCTAVES = 10
+
+
+def encode(values: Tensor, octaves: int = OCTAVES) -> Tensor:
+    """[N, D] to [N, D (1 + 2 octaves)]: the values, then sine and cosine of every octave in turn."""
+    parts = [values]
+    for octave in range(octaves):
+        parts += [torch.sin(values * 2.0**octave), torch.cos(values * 2.0**octave)]
+    return torch.cat(parts, dim=1)
+
+
+class Deformation(nn.Module):
+    """F: positions [N, 3] and a time in [0, 1] to shifts [N, 3], turns [N, 4] and growths [N, 3]; scene units.
+
+    center [3], unit: of the box that the octaves suit, scene units.
+    """
+
+    center: Tensor
+    unit: Tensor
+
+    def __init__(self, depth: int = 8, width: int = 256) -> None:
+        super().__init__()
+        self.register_buffer("center", torch.zeros(3))
+        self.register_buffer("unit", torch.ones(()))
+        self._inputs = (3 + 1) * (1 + 2 * OCTAVES)
+        self._again = depth // 2
+        sizes = [self._inputs] + [width] * (depth - 1)
+        self.layers = nn.ModuleList(
+            nn.Linear(size + (self._inputs if i == self._again + 1 else 0), width) for i, size in enumerate(sizes)
+        )
+        self.shift, self.turn, self.growth = nn.Linear(width, 3), nn.Linear(width, 4), nn.Linear(width, 3)
+
+    def silence(self) -> None:
+        """Zero the heads: nothing moves until the fit says so. As published, the start is a random deformation."""
+        with torch.no_grad():
+            for head in (self.shift, self.turn, self.growth):
+                head.weight.zero_()
+                head.bias.zero_()
+
+    def forward(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
+        positions = (positions - self.center) / self.unit
+        times = positions.new_full((1, 1), time)
+        # The time is the same for all: its encoding is worked out once.
+        encoded = torch.cat([encode(positions), encode(times).expand(len(positions), -1)], dim=1)
+        hidden = encoded
+        for i, layer in enumerate(self.layers):
+            if i == self._again + 1:
+                hidden = torch.cat([encoded, hidden], dim=1)
+            hidden = torch.relu(layer(hidden))
+        return self.unit * self.shift(hidden), self.turn(hidden), self.unit * self.growth(hidden)

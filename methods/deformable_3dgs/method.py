@@ -1,0 +1,106 @@
+"""Deformable-3DGS as a method: start, fit, load (Yang et al., "Deformable 3D Gaussians", CVPR 2024)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from splashbench_methods.deformable_3dgs.model import ROWS, DeformableModel
+from splashbench_methods.deformable_3dgs.settings import Settings
+from splashbench_methods.gaussian_splatting.density import DensityControl
+from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
+from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
+from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
+from splashbench_methods.gaussian_splatting.photographs import Photographs
+from splashbench_methods.gaussian_splatting.start import camera_extent, hull_points, joined, static_points
+
+from splashbench.adapter.contract import Method, MethodConfig, Run
+from splashbench.files import read_npz
+from splashbench.render.torch_threads import one_torch_thread
+from splashbench.scene import TrainingScene
+
+
+def rates(settings: Settings, extent: float) -> dict[str, Rate]:
+    """Learning rates by table; `extent` of the cameras, scene units."""
+    factor, network, color = settings.rate_factor, settings.network_factor, 2.5e-3 * settings.color_factor
+    position = 1.6e-4 * extent * factor
+    published = {
+        "positions": Rate(position, position / 100, until=0.75),
+        "log_scales": Rate.constant(5e-3),
+        "quaternions": Rate.constant(1e-3),
+        "opacity_logits": Rate.constant(0.05),
+        "constant": Rate.constant(color),
+        "rest": Rate.constant(color / 20),
+        "deformation": Rate(8e-4 * network, 1.6e-6 * network, begin=settings.warm_up),
+    }
+    if settings.rates == "published":
+        return published
+    return {name: rate.short() for name, rate in published.items()}
+
+
+class Deformable3DGS(Method):
+    """Canonical Gaussians and a deformation network; background and liquid are one set."""
+
+    id: ClassVar[str] = "deformable_3dgs"
+    title: ClassVar[str] = "Deformable-3DGS"
+    Config: ClassVar[type[MethodConfig]] = Settings
+    mixed: ClassVar[bool] = True
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
+        rng = np.random.default_rng(run.seed)
+        run.progress(0, "collecting points")
+        with one_torch_thread(), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(run.seed)
+            with run.stage("start"):
+                static = static_points(scene, config.static_points, config.static, rng)
+                # One canonical set for all times: points of several frames would all be there in every one.
+                liquid = hull_points(scene, config.hull_points, largest_only=True)
+                start = joined(static, liquid)
+            model = DeformableModel.from_start(
+                start, config.start_opacity, config.sh_degree, config.depth, config.width
+            )
+            extent = camera_extent(scene)
+            optimizer = RowOptimizer(model, rates(config, extent), ROWS, config.iterations)
+            noise = _TimeNoise(config, scene.n_frames, rng)
+
+            def begin_step(step: int) -> float:
+                model.deforms = step >= config.warm_up * config.iterations
+                model.active_degree = min(config.sh_degree, step // config.sh_every)
+                return noise.at(step)
+
+            with run.stage("fit"):
+                history = fit_dynamic(
+                    model,
+                    optimizer,
+                    DensityControl(optimizer, config.density(extent)),
+                    Photographs(scene, config.longest_side, config.views_per_step, rng),
+                    lambda done: run.progress(done, f"fitting {len(model.positions)} Gaussians"),
+                    begin_step,
+                )
+        model.deforms, model.active_degree = True, config.sh_degree
+        return MixedFitted(model, scene, history)
+
+    def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
+        path = directory / MODEL_FILE
+        found = read_npz(path, {"rest": 3, "deformation.shift.weight": 2})
+        degree = round((found["rest"].shape[1] + 1) ** 0.5) - 1
+        with np.load(path, allow_pickle=False) as archive:
+            depth = sum(name.startswith("deformation.layers.") and name.endswith("weight") for name in archive.files)
+        model = DeformableModel(0, degree, depth, found["deformation.shift.weight"].shape[1])
+        load_tables(path, model, ROWS)
+        return MixedFitted(model, scene)
+
+
+class _TimeNoise:
+    """Annealed smoothing of the time (Yang et al. 2024, Eq. 6): Gaussian noise that falls to nothing."""
+
+    def __init__(self, config: Settings, n_frames: int, rng: np.random.Generator) -> None:
+        self._until = config.time_noise_until * config.iterations
+        self._sigma = config.time_noise / (n_frames - 1) if n_frames > 1 else 0.0
+        self._rng = rng
+
+    def at(self, step: int) -> float:
+        left = max(0.0, 1 - step / self._until)
+        return float(self._rng.normal()) * self._sigma * left

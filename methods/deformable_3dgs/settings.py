@@ -1,0 +1,44 @@
+"""Settings of Deformable-3DGS: "paper" has the recommended ones for real scenes, "quick" fits on two cores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from pydantic import Field
+from splashbench_methods.gaussian_splatting.settings import SplattingSettings
+
+
+class Settings(SplattingSettings):
+    """How canonical Gaussians and their deformation are fitted; besides what all baselines share:
+
+    Attributes:
+        warm_up: share of the iterations in which the network does not take part yet.
+        time_noise: standard deviation of the noise on a step's time at the start, in frames; it falls to 0 over
+            the share `time_noise_until`.
+        depth, width: of the network.
+        network_factor: times the published learning rate of the network.
+        sh_degree: of the colours; one degree more every `sh_every` steps.
+    """
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {
+            "iterations": 700, "views_per_step": 2, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
+            "color_factor": 4.0, "network_factor": 2.0,
+        },
+        "paper": {
+            "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "depth": 8, "width": 256, "sh_degree": 3,
+            "sh_every": 1000, "static": "points", "static_points": 100_000, "hull_points": 100_000,
+            "start_opacity": 0.1, "most": 500_000, "grow_from": 0.025, "grow_until": 0.75, "prune_until": 0.75,
+            "reset_every": 3000, "reset_until": 0.75, "rates": "published", "longest_side": 16384,
+        },
+    }  # fmt: skip
+
+    warm_up: float = Field(default=0.1, ge=0, le=1)
+    time_noise: float = Field(default=0.1, ge=0, le=10)
+    time_noise_until: float = Field(default=0.5, gt=0, le=1)
+    depth: int = Field(default=8, ge=2, le=32)
+    width: int = Field(default=96, ge=4, le=1024)
+    network_factor: float = Field(default=1.0, gt=0, le=1000)
+    sh_degree: int = Field(default=1, ge=0, le=3)
+    sh_every: int = Field(default=200, ge=1)

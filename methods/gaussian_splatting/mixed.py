@@ -1,0 +1,101 @@
+"""A fitted model in which background and liquid are one set of Gaussians: its renders, and the liquid among them.
+
+The liquid is what the silhouettes allow (observe/consistency.py): its Gaussians alone give the opacity of the liquid,
+and its positions are the particles. The training masks say so when the model is loaded, not while it is fitted.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from splashbench_methods.gaussian_splatting.fitting import History
+from splashbench_methods.gaussian_splatting.photographs import unit_time
+from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats
+
+from splashbench.adapter.contract import Fitted, Render
+from splashbench.errors import SplashbenchError, one_line
+from splashbench.files import atomic_path, read_npz
+from splashbench.observe.consistency import silhouette_consistent
+from splashbench.render import counters, rasterize_arrays
+from splashbench.render.constants import MIN_ALPHA
+from splashbench.render.torch_threads import one_torch_thread
+from splashbench.scene import Camera, Particles, TrainingScene
+
+MODEL_FILE = "model.npz"
+_HISTORY_FILE = "history.json"
+
+
+class MixedFitted(Fitted):
+    """`model`, fitted to `scene`."""
+
+    def __init__(self, model: DynamicModel, scene: TrainingScene, history: History | None = None) -> None:
+        self.model, self.scene, self.history = model.eval(), scene, history
+        self._liquid: dict[int, NDArray[np.bool_]] = {}
+
+    @torch.no_grad()
+    def render(self, camera: Camera, time: float) -> Render:
+        unit = unit_time(self.scene, time)
+        with one_torch_thread():
+            splats = self.model.splats(self.model.at(unit), camera)
+            image = self.model.view(splats, camera, unit).clamp(0, 1).numpy()
+        liquid = self.liquid(int(np.abs(self.scene.times - time).argmin()))
+        means, factors, opacities = (t.numpy()[liquid] for t in (splats.means, splats.factors, splats.opacities))
+        with counters.uncounted():  # asked for by the protocol, no part of the method's image
+            _, alpha = rasterize_arrays(means, factors, opacities, None, camera)
+        return Render(image, alpha)
+
+    def liquid(self, t: int) -> NDArray[np.bool_]:
+        """bool [N]: the Gaussians that the silhouettes of timestep `t` allow to be liquid."""
+        if t not in self._liquid:
+            self._liquid[t] = silhouette_consistent(self._instant(t)[0], self.scene, t)
+        return self._liquid[t]
+
+    @torch.no_grad()
+    def _instant(self, t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Means [N, 3] at timestep `t`, and whether a Gaussian is drawn at all in some training view, [N]."""
+        with one_torch_thread():
+            state = self.model.at(unit_time(self.scene, float(self.scene.times[t])))
+            views: list[Splats] = [self.model.splats(state, camera) for camera in self.scene.cameras.values()]
+        strongest = np.stack([view.opacities.numpy() for view in views]).max(axis=0)
+        return views[0].means.numpy(), strongest >= MIN_ALPHA
+
+    def particles(self) -> Particles | None:
+        instants = [self._instant(t) for t in range(self.scene.n_frames)]
+        active = np.stack([drawn & self.liquid(t) for t, (_, drawn) in enumerate(instants)])
+        ever = active.any(axis=0)
+        return Particles(np.stack([means[ever] for means, _ in instants]), active[:, ever])
+
+    def save(self, directory: Path) -> None:
+        arrays = {name: tensor.detach().numpy() for name, tensor in self.model.state_dict().items()}
+        with atomic_path(directory / MODEL_FILE) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        if self.history is not None:
+            steps = np.array_split(self.history.psnr, min(100, len(self.history.psnr)))
+            facts = {
+                "training_psnr": [round(float(part.mean()), 4) for part in steps],
+                "gained_in_last_quarter": round(self.history.gained_in_last_quarter(), 4),
+            }
+            with atomic_path(directory / _HISTORY_FILE) as temporary:
+                temporary.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+
+
+def load_tables(model_file: Path, model: DynamicModel, rows: tuple[str, ...]) -> None:
+    """Fill `model` with what `MixedFitted.save` wrote; tables `rows` may have any number of rows, the same for all.
+
+    Raises SplashbenchError where the file does not go with the model.
+    """
+    shapes = {name: tensor.ndim for name, tensor in model.state_dict().items()}
+    arrays = read_npz(model_file, shapes)
+    count = len(arrays[rows[0]])
+    for name in rows:
+        old = model.get_parameter(name)
+        setattr(model, name, torch.nn.Parameter(torch.zeros(count, *old.shape[1:])))
+    try:
+        model.load_state_dict({name: torch.from_numpy(arrays[name]) for name in shapes})
+    except RuntimeError as error:
+        said = one_line(str(error))
+        raise SplashbenchError(f"{model_file} does not go with this method ({said}); fit again") from None

@@ -1,0 +1,99 @@
+"""Adam over a model whose rows come and go: rates that decay, and rows that keep their moments."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+_SHORT_LAST = 0.01
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate that falls exponentially from `first` to `last` over the share `until` of the fit.
+
+    begin: share of the fit before which it is 0.
+    """
+
+    first: float
+    last: float
+    until: float = 1.0
+    begin: float = 0.0
+
+    @classmethod
+    def constant(cls, value: float) -> Rate:
+        """The same all along."""
+        return cls(value, value)
+
+    def short(self) -> Rate:
+        """The same at first, for a short fit: it falls to a hundredth until the end."""
+        return Rate(self.first, self.first * _SHORT_LAST, begin=self.begin)
+
+    def at(self, done: float) -> float:
+        """The rate when the share `done` of the fit is done."""
+        if done < self.begin:
+            return 0.0
+        return self.first * (self.last / self.first) ** min(1.0, done / self.until)
+
+
+class RowOptimizer:
+    """Updates `model` over `iterations` steps.
+
+    rates: by attribute of the model, a parameter or a module. rows: those of them that have a row per primitive.
+    """
+
+    def __init__(self, model: nn.Module, rates: Mapping[str, Rate], rows: Collection[str], iterations: int) -> None:
+        self.model, self.rates, self.rows = model, dict(rates), tuple(rows)
+        self.iterations, self.step_count = iterations, 0
+        groups = [{"params": self._parameters(name), "name": name} for name in self.rates]
+        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+
+    def _parameters(self, name: str) -> list[nn.Parameter]:
+        part = getattr(self.model, name)
+        return [part] if isinstance(part, nn.Parameter) else list(part.parameters())
+
+    @property
+    def done(self) -> float:
+        """The share of the fit that is done."""
+        return self.step_count / self.iterations
+
+    def step(self) -> None:
+        """One step along the gradients, which are then gone."""
+        for group in self.adam.param_groups:
+            group["lr"] = self.rates[group["name"]].at(self.done)
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+        self.step_count += 1
+
+    def replace_rows(self, kept: NDArray[np.int64], new: Mapping[str, Tensor]) -> None:
+        """Keep the rows `kept` and append `new` ones, given for each of `rows`; these start without moments."""
+        index = torch.from_numpy(kept)
+        for group in self.adam.param_groups:
+            name = group["name"]
+            if name not in self.rows:
+                continue
+            old = getattr(self.model, name)
+            parameter = nn.Parameter(torch.cat([old.detach()[index], new[name]]))
+            state = self.adam.state.pop(old, None)
+            if state:
+                blank = torch.zeros_like(new[name])
+                moments = {key: torch.cat([state[key][index], blank]) for key in ("exp_avg", "exp_avg_sq")}
+                self.adam.state[parameter] = {**state, **moments}
+            setattr(self.model, name, parameter)
+            group["params"] = [parameter]
+
+    def set_rows(self, name: str, values: Tensor, rows: Tensor | None = None) -> None:
+        """Give the table `name`, or its `rows` (int64), new values; their moments are gone."""
+        parameter = getattr(self.model, name)
+        where = slice(None) if rows is None else rows
+        with torch.no_grad():
+            parameter[where] = values
+        state = self.adam.state.get(parameter)
+        if state:
+            for key in ("exp_avg", "exp_avg_sq"):
+                state[key][where] = 0

@@ -1,0 +1,65 @@
+"""What a dynamic model shows at one instant: Gaussians, and how their pixels become colours."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from splashbench.render import rasterize
+from splashbench.scene import Camera
+
+
+@dataclass
+class Splats:
+    """N Gaussians as a camera is to see them: means [N, 3], factors [N, 3, 3] of the covariances B B^T, scene units.
+
+    opacities: [N] in [0, 1]; colors: [N, C], of any meaning (`DynamicModel.image`). penalty: a scalar that a fit adds
+    to its loss, or None.
+    """
+
+    means: Tensor
+    factors: Tensor
+    opacities: Tensor
+    colors: Tensor
+    penalty: Tensor | None = None
+
+
+class DynamicModel(nn.Module, ABC):
+    """A scene of Gaussians in motion. Times run from 0 to 1 over the recording."""
+
+    def at(self, time: float) -> Any:
+        """What all views of one instant share, such as a network's output; it is handed to `splats`."""
+        return time
+
+    @abstractmethod
+    def splats(self, state: Any, camera: Camera) -> Splats:
+        """The Gaussians at the instant of `state` (see `at`) as `camera` is to see them."""
+
+    def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
+        """Colours [H, W, 3] of what was rasterized [H, W, C]; as it is, unless a network decodes it."""
+        return rendered
+
+    def view(self, splats: Splats, camera: Camera, time: float) -> Tensor:
+        """The image [H, W, 3] of `splats` over black; not clipped."""
+        rendered, _ = rasterize(splats.means, splats.factors, splats.opacities, splats.colors, camera)
+        return self.image(rendered, camera, time)
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """Rotations [N, 3, 3] of quaternions [N, 4] (w x y z), normalised here."""
+    w, x, y, z = nn.functional.normalize(quaternions, dim=1).unbind(1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=1).view(-1, 3, 3)
+
+
+def ellipsoids(log_scales: Tensor, quaternions: Tensor) -> Tensor:
+    """Factors [N, 3, 3] of Gaussians with axes exp(log_scales) [N, 3], turned by `quaternions` [N, 4]."""
+    return rotation_matrices(quaternions) * torch.exp(log_scales)[:, None]

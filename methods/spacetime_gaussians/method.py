@@ -1,0 +1,101 @@
+"""SpacetimeGaussians as methods, full and lite (Li et al., "Spacetime Gaussian Feature Splatting", CVPR 2024)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from splashbench_methods.gaussian_splatting.density import DensityControl
+from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
+from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
+from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
+from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
+from splashbench_methods.gaussian_splatting.start import camera_extent, hull_points, joined, static_points
+from splashbench_methods.spacetime_gaussians.guided import GuidedDensity
+from splashbench_methods.spacetime_gaussians.model import SpacetimeModel
+from splashbench_methods.spacetime_gaussians.settings import Settings
+from torch import Tensor
+
+from splashbench.adapter.contract import Method, MethodConfig, Run
+from splashbench.render.torch_threads import one_torch_thread
+from splashbench.scene import TrainingScene
+
+
+def rates(settings: Settings, extent: float, full: bool) -> dict[str, Rate]:
+    """Learning rates by table; `extent` of the cameras, scene units."""
+    factor, color = settings.rate_factor, settings.color_factor
+    position, motion = 1.6e-4 * extent * factor, 2.8e-4 * extent * factor
+    published = {
+        "positions": Rate(position, position / 100),
+        "motions": Rate.constant(motion),
+        "log_scales": Rate.constant(5e-3),
+        "quaternions": Rate.constant(1e-3),
+        "spins": Rate.constant(1e-4),
+        "opacity_logits": Rate.constant(0.05),
+        "times": Rate.constant(1e-4),
+        "log_widths": Rate.constant(0.03),
+        "base": Rate.constant(2.5e-3 * color),
+    }
+    if full:
+        published |= {
+            "features": Rate.constant(2.5e-3 * color),
+            "time_features": Rate.constant(1e-3 * color),
+            "decoder": Rate.constant(1e-4 * color),
+        }
+    if settings.rates == "published":
+        return published
+    return {name: rate.short() for name, rate in published.items()}
+
+
+class SpacetimeGaussians(Method):
+    """Gaussians that fade in and out and move on polynomials; background and liquid are one set."""
+
+    id: ClassVar[str] = "spacetime_gaussians"
+    title: ClassVar[str] = "SpacetimeGaussians, full"
+    Config: ClassVar[type[MethodConfig]] = Settings
+    mixed: ClassVar[bool] = True
+    full: ClassVar[bool] = True
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
+        rng = np.random.default_rng(run.seed)
+        run.progress(0, "collecting points")
+        with one_torch_thread(), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(run.seed)
+            with run.stage("start"):
+                static = static_points(scene, config.static_points, config.static, rng)
+                start = joined(static, hull_points(scene, config.hull_points))
+            times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
+            model = SpacetimeModel.from_start(start, self.full, config.start_opacity, config.hull_log_width, times)
+            extent = camera_extent(scene)
+            optimizer = RowOptimizer(model, rates(config, extent, self.full), model.rows, config.iterations)
+            photographs = Photographs(scene, config.longest_side, config.views_per_step, rng)
+            density = DensityControl(optimizer, config.density(extent), _new_times)
+            with run.stage("fit"):
+                history = fit_dynamic(
+                    model,
+                    optimizer,
+                    GuidedDensity(density, model, photographs, config, rng),
+                    photographs,
+                    lambda done: run.progress(done, f"fitting {len(model.positions)} Gaussians"),
+                )
+        return MixedFitted(model, scene, history)
+
+    def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
+        model = SpacetimeModel(0, self.full)
+        load_tables(directory / MODEL_FILE, model, model.rows)
+        return MixedFitted(model, scene)
+
+
+class SpacetimeGaussiansLite(SpacetimeGaussians):
+    """The lite model: a colour per Gaussian instead of features and a decoder."""
+
+    id: ClassVar[str] = "spacetime_gaussians_lite"
+    title: ClassVar[str] = "SpacetimeGaussians, lite"
+    full: ClassVar[bool] = False
+
+
+def _new_times(rows: dict[str, Tensor]) -> None:
+    """Gaussians made from others get a time anywhere in the recording, as published."""
+    rows["times"] = torch.rand_like(rows["times"])

@@ -1,0 +1,115 @@
+"""Gaussians with a time of their own (Li et al. 2024, Eq. 6-10).
+
+With d = t - tau, cut off from the gradient in motion, rotation and features:
+
+    mean = x + b1 d + b2 d^2 + b3 d^3,  rotation = normalise(q + w d),  opacity = sigmoid(o) exp(-(d / e^s)^2)
+
+Lite has a colour per Gaussian. Full splats nine channels, a base colour, a feature seen from everywhere and d times a
+feature of the time, and decodes them with the pixel's ray: sigmoid(base + W2 relu(W1 [f, f_t d, ray])).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, rotation_matrices
+from splashbench_methods.gaussian_splatting.start import Start
+from torch import Tensor, nn
+
+from splashbench.scene import Camera
+
+#: Tables with a row per Gaussian; "features" and "time_features" are of the full model alone.
+LITE_ROWS = (
+    "positions", "motions", "log_scales", "quaternions", "spins", "opacity_logits", "times", "log_widths", "base",
+)  # fmt: skip
+FULL_ROWS = (*LITE_ROWS, "features", "time_features")
+
+
+class State(NamedTuple):
+    """The Gaussians at an instant: means [N, 3], factors [N, 3, 3], opacities [N], channels [N, C]."""
+
+    means: Tensor
+    factors: Tensor
+    opacities: Tensor
+    channels: Tensor
+
+
+class SpacetimeModel(DynamicModel):
+    """N Gaussians; times and widths in recordings, positions in scene units."""
+
+    def __init__(self, n: int, full: bool) -> None:
+        super().__init__()
+        self.full = full
+        self.positions = nn.Parameter(torch.zeros(n, 3))
+        self.motions = nn.Parameter(torch.zeros(n, 3, 3))  # by power of d, then axis
+        self.log_scales = nn.Parameter(torch.zeros(n, 3))
+        self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(n, 1))
+        self.spins = nn.Parameter(torch.zeros(n, 4))
+        self.opacity_logits = nn.Parameter(torch.zeros(n))
+        self.times = nn.Parameter(torch.zeros(n))
+        self.log_widths = nn.Parameter(torch.zeros(n))
+        self.base = nn.Parameter(torch.zeros(n, 3))
+        if full:
+            self.features = nn.Parameter(torch.zeros(n, 3))
+            self.time_features = nn.Parameter(torch.zeros(n, 3))
+            self.decoder = nn.Sequential(nn.Linear(12, 6, bias=False), nn.ReLU(), nn.Linear(6, 3, bias=False))
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """The tables with a row per Gaussian."""
+        return FULL_ROWS if self.full else LITE_ROWS
+
+    @classmethod
+    def from_start(
+        cls, start: Start, full: bool, opacity: float, log_width: float, times: np.ndarray
+    ) -> SpacetimeModel:
+        """A model about to be fitted; times: [frames] in [0, 1]. Static points last all the recording long."""
+        model = cls(len(start), full)
+        colors, static = torch.from_numpy(start.colors), torch.from_numpy(start.frame < 0)
+        own = torch.from_numpy(np.asarray(times, np.float32))[torch.from_numpy(start.frame.clip(min=0))]
+        with torch.no_grad():
+            model.positions.copy_(torch.from_numpy(start.positions))
+            model.log_scales.copy_(torch.from_numpy(start.spacing).log()[:, None].expand(-1, 3))
+            model.opacity_logits.fill_(float(torch.logit(torch.tensor(opacity))))
+            model.times.copy_(torch.where(static, 0.5, own))
+            model.log_widths.copy_(torch.where(static, 0.0, log_width))
+            model.base.copy_(torch.logit(colors.clamp(0.01, 0.99)) if full else colors)
+            if full:
+                model.features.copy_(colors)
+                model.decoder[2].weight.zero_()  # the fit begins with the points' own colours
+        return model
+
+    def at(self, time: float) -> State:
+        since = time - self.times
+        cut = since.detach()
+        powers = torch.stack([cut, cut**2, cut**3], dim=1)
+        means = self.positions + (powers[:, :, None] * self.motions).sum(dim=1)
+        factors = rotation_matrices(self.quaternions + self.spins * cut[:, None]) * torch.exp(self.log_scales)[:, None]
+        opacities = torch.sigmoid(self.opacity_logits) * torch.exp(-((since / torch.exp(self.log_widths)) ** 2))
+        channels = [self.base]
+        if self.full:
+            channels += [self.features, self.time_features * cut[:, None]]
+        return State(means, factors, opacities, torch.cat(channels, dim=1))
+
+    def splats(self, state: State, camera: Camera) -> Splats:
+        return Splats(state.means, state.factors, state.opacities, state.channels)
+
+    def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
+        if not self.full:
+            return rendered
+        base, features, timed = rendered.split(3, dim=2)
+        decoded = self.decoder(torch.cat([features, timed, torch.from_numpy(rays(camera))], dim=2))
+        return torch.sigmoid(base + decoded)
+
+
+def rays(camera: Camera) -> np.ndarray:
+    """Origin and unit direction of every pixel's ray, scene units: float32 [H, W, 6]."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    local = np.stack(
+        [(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones_like(u)], axis=-1
+    )
+    directions = local @ camera.w2c[:3, :3]
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.concatenate([np.broadcast_to(camera.center, directions.shape), directions], axis=-1).astype(np.float32)

@@ -1,0 +1,37 @@
+"""Settings of SpacetimeGaussians: "paper" has the recommended ones, "quick" fits on two cores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from pydantic import Field
+from splashbench_methods.gaussian_splatting.settings import SplattingSettings
+
+
+class Settings(SplattingSettings):
+    """How Gaussians with a time of their own are fitted; besides what all baselines share:
+
+    Attributes:
+        hull_log_width: logarithm of how long points of the hull last at the start, in recordings.
+        guided_from, guided_until: shares between which Gaussians are placed where the worst view errs (guided.py),
+            every `guided_every` steps; equal for never. guided_patches: patches of pixels each time.
+    """
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {
+            "iterations": 600, "hull_points": 20_000, "most": 30_000, "rate_factor": 4.0, "color_factor": 4.0,
+        },
+        "paper": {
+            "iterations": 30_000, "views_per_step": 2, "static": "points", "static_points": 100_000,
+            "hull_points": 200_000, "start_opacity": 0.1, "most": 1_000_000, "grow_from": 0.02, "grow_until": 0.06,
+            "prune_until": 0.2333, "reset_every": 3000, "reset_until": 0.3, "rates": "published",
+            "longest_side": 16384, "guided_from": 0.0533, "guided_until": 0.1, "hull_log_width": -2.0,
+        },
+    }  # fmt: skip
+
+    hull_log_width: float = Field(default=-3.0, ge=-10, le=3)
+    guided_from: float = Field(default=0.0, ge=0, le=1)
+    guided_until: float = Field(default=0.0, ge=0, le=1)
+    guided_every: int = Field(default=200, ge=1)
+    guided_patches: int = Field(default=32, ge=1, le=100_000)

@@ -1,0 +1,294 @@
+"""What the Gaussian-splatting baselines share: colours, rates, growth, photographs, start, and the liquid in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from splashbench_methods.gaussian_splatting import harmonics
+from splashbench_methods.gaussian_splatting.density import DensityControl, DensitySettings
+from splashbench_methods.gaussian_splatting.fitting import History
+from splashbench_methods.gaussian_splatting.mixed import MixedFitted
+from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
+from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
+from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, ellipsoids
+from splashbench_methods.gaussian_splatting.start import hull_points, joined, static_points
+from torch import nn
+
+from splashbench.render.torch_threads import one_torch_thread
+from splashbench.scene import Camera, Scene
+from splashbench.synth.balls import ball_centers
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with one_torch_thread(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        yield
+
+
+class TestHarmonics:
+    def test_the_basis_is_orthonormal_on_the_sphere(self) -> None:
+        # Gauss-Legendre in z and even steps in the angle integrate polynomials of degree 6 exactly.
+        z, weight = np.polynomial.legendre.leggauss(8)
+        angle = np.arange(16) / 16 * 2 * np.pi
+        s = np.sqrt(1 - z**2)
+        directions = np.stack(
+            [np.outer(s, np.cos(angle)), np.outer(s, np.sin(angle)), np.outer(z, np.ones(16))], axis=-1
+        ).reshape(-1, 3)
+        values = harmonics.basis(torch.from_numpy(directions), 3).numpy()
+        weights = np.repeat(weight, 16) * 2 * np.pi / 16
+        np.testing.assert_allclose((values * weights[:, None]).T @ values, np.eye(16), atol=1e-12)
+
+    def test_order_and_signs_are_those_of_published_point_clouds(self) -> None:
+        axes = harmonics.basis(torch.eye(3, dtype=torch.float64), 1).numpy()
+        c0, c1 = 0.28209479177387814, 0.4886025119029199
+        np.testing.assert_allclose(axes, [[c0, 0, 0, -c1], [c0, -c1, 0, 0], [c0, 0, c1, 0]], atol=1e-15)
+        diagonal = torch.full((1, 3), 3**-0.5, dtype=torch.float64)
+        second, third = np.split(harmonics.basis(diagonal, 3).numpy()[0, 4:], [5])
+        np.testing.assert_allclose(
+            second, [1.0925484305920792 / 3, -1.0925484305920792 / 3, 0, -1.0925484305920792 / 3, 0], atol=1e-12
+        )
+        a, b, c, d = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154
+        np.testing.assert_allclose(third * 3**1.5, [-2 * a, b, -2 * c, -4 * d, -2 * c, 0, 2 * a], atol=1e-12)
+
+    def test_a_colour_comes_back_from_its_constant(self) -> None:
+        colors = torch.tensor([[0.1, 0.5, 0.9]])
+        seen = harmonics.colors(harmonics.constant_of(colors), torch.zeros(1, 0, 3), torch.tensor([[0.0, 0, 1]]), 0)
+        torch.testing.assert_close(seen, colors)
+
+    def test_only_the_active_degree_takes_part(self) -> None:
+        rest = torch.randn(5, 15, 3)
+        direction = nn.functional.normalize(torch.randn(5, 3), dim=1)
+        constant = torch.full((5, 3), 0.3)
+        flat = harmonics.colors(constant, rest, direction, 0)
+        torch.testing.assert_close(flat, harmonics.CONSTANT * constant + 0.5)
+        linear = harmonics.colors(constant + 10, rest, direction, 1)
+        zeroed = rest.clone()
+        zeroed[:, 3:] = 0
+        torch.testing.assert_close(linear, harmonics.colors(constant + 10, zeroed, direction, 3))
+
+
+def test_a_rate_begins_falls_and_stays() -> None:
+    rate = Rate(1.0, 0.01, until=0.5, begin=0.1)
+    assert [rate.at(done) for done in (0.05, 0.25, 0.5, 1.0)] == pytest.approx([0, 0.1, 0.01, 0.01])
+    assert Rate.constant(0.3).short().at(1.0) == pytest.approx(0.003)
+
+
+class Table(DynamicModel):
+    """Gaussians that stay where they are; the smallest model with the tables that density control wants."""
+
+    def __init__(self, positions: np.ndarray, scale: float = 0.05, opacity: float = 0.5) -> None:
+        super().__init__()
+        n = len(positions)
+        self.positions = nn.Parameter(torch.tensor(positions, dtype=torch.float32))
+        self.log_scales = nn.Parameter(torch.full((n, 3), float(np.log(scale))))
+        self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(n, 1))
+        self.opacity_logits = nn.Parameter(torch.full((n,), float(np.log(opacity / (1 - opacity)))))
+
+    def splats(self, state: object, camera: Camera) -> Splats:
+        colors = torch.full((len(self.positions), 3), 0.5)
+        factors = ellipsoids(self.log_scales, self.quaternions)
+        return Splats(self.positions, factors, torch.sigmoid(self.opacity_logits), colors)
+
+
+ROWS = ("positions", "log_scales", "quaternions", "opacity_logits")
+
+
+def optimizer_of(model: Table, iterations: int = 100) -> RowOptimizer:
+    return RowOptimizer(model, {name: Rate.constant(0.01) for name in ROWS}, ROWS, iterations)
+
+
+class TestRows:
+    def test_kept_rows_go_on_as_if_nothing_had_happened(self) -> None:
+        targets = torch.randn(6, 3)
+        models = [Table(np.zeros((6, 3))) for _ in range(2)]
+        optimizers = [optimizer_of(model) for model in models]
+        for step in range(8):
+            kept = torch.arange(6) if step < 4 else torch.tensor([1, 4])
+            for i, (model, optimizer) in enumerate(zip(models, optimizers)):
+                rows = torch.arange(2) if i == 1 and step >= 4 else kept
+                ((model.positions[rows] - targets[kept]) ** 2).sum().backward()
+                optimizer.step()
+            if step == 3:
+                new = {name: models[1].get_parameter(name).detach()[:1] + 7 for name in ROWS}
+                optimizers[1].replace_rows(np.array([1, 4]), new)
+        torch.testing.assert_close(models[1].positions[:2], models[0].positions[[1, 4]])
+        assert len(models[1].positions) == 3
+
+    def test_values_that_are_set_have_no_momentum(self) -> None:
+        model = Table(np.zeros((2, 3)))
+        optimizer = optimizer_of(model)
+        for _ in range(3):
+            model.positions.sum().backward()
+            optimizer.step()
+        optimizer.set_rows("positions", torch.ones(1, 3), torch.tensor([1]))
+        (model.positions * 0).sum().backward()
+        optimizer.step()
+        torch.testing.assert_close(model.positions[1], torch.ones(3))
+        assert (model.positions[0] < -0.03).all()  # its momentum goes on
+
+
+def look() -> Camera:
+    w2c = np.eye(4)
+    w2c[2, 3] = 3
+    return Camera("1", 96, 64, np.array([[96.0, 0, 48], [0, 96.0, 32], [0, 0, 1]]), w2c)
+
+
+def density_of(model: Table, **changes: float) -> DensityControl:
+    settings = {"start": 0, "stop": 100, "every": 1, "gradient": 1.0, "large": 0.1, "most": 100, **changes}
+    return DensityControl(optimizer_of(model), DensitySettings(**settings))  # type: ignore[arg-type]
+
+
+def pull(model: Table, density: DensityControl, rows: list[int]) -> None:
+    """One view in which the loss pulls hard at `rows` and a little at the others."""
+    gradients = torch.full((len(model.positions), 3), 1e-4)
+    gradients[rows] = 10.0
+    density.observe(look(), model.splats(None, look()), gradients)
+
+
+class TestDensity:
+    def test_small_ones_are_cloned_where_the_loss_pulls(self) -> None:
+        model = Table(np.arange(12).reshape(4, 3) / 20)
+        density = density_of(model)
+        pull(model, density, [2])
+        density.after_step(0)
+        assert len(model.positions) == 5
+        torch.testing.assert_close(model.positions[4], model.positions[2])
+        torch.testing.assert_close(model.log_scales[4], model.log_scales[2])
+
+    def test_large_ones_are_split_within_themselves(self) -> None:
+        model = Table(np.zeros((400, 3)), scale=0.5)
+        density = density_of(model, most=1000)
+        pull(model, density, list(range(400)))
+        density.after_step(0)
+        assert len(model.positions) == 800
+        torch.testing.assert_close(torch.exp(model.log_scales), torch.full((800, 3), 0.5 / 1.6))
+        spread = model.positions.detach().numpy()
+        assert spread.std(axis=0) == pytest.approx([0.5] * 3, rel=0.1)
+        assert abs(np.corrcoef(spread[:400, 0], spread[400:, 0])[0, 1]) < 0.15
+
+    def test_faint_ones_go_and_the_strongest_pulls_come_first_within_the_limit(self) -> None:
+        model = Table(np.zeros((6, 3)))
+        with torch.no_grad():
+            model.opacity_logits[0] = -9.0
+        density = density_of(model, most=7)
+        pull(model, density, [0, 3, 4, 5])
+        density.observe(look(), model.splats(None, look()), torch.tensor([0.0, 0, 0, 0, 99, 99])[:, None].repeat(1, 3))
+        with torch.no_grad():
+            model.positions[4:, 0] = torch.tensor([4.0, 5.0])
+        density.after_step(0)
+        assert model.positions[:, 0].tolist() == [0, 0, 0, 4, 5, 4, 5]
+
+    def test_a_model_of_faint_ones_keeps_one(self) -> None:
+        model = Table(np.zeros((3, 3)), opacity=1e-4)
+        density = density_of(model)
+        density.after_step(0)
+        assert len(model.positions) == 1
+
+    def test_pruning_goes_on_after_growth(self) -> None:
+        model = Table(np.zeros((3, 3)))
+        density = density_of(model, stop=5, prune_until=10)
+        with torch.no_grad():
+            model.opacity_logits[1] = -9.0
+        pull(model, density, [0, 2])
+        density.after_step(7)
+        assert len(model.positions) == 2
+
+    def test_opacities_are_reset_at_their_steps_alone(self) -> None:
+        model = Table(np.zeros((3, 3)), opacity=0.9)
+        density = density_of(model, start=1000, reset_every=10, reset_until=25)
+        density.after_step(8)
+        assert torch.sigmoid(model.opacity_logits).tolist() == pytest.approx([0.9] * 3)
+        density.after_step(9)
+        assert torch.sigmoid(model.opacity_logits).tolist() == pytest.approx([0.01] * 3)
+        with torch.no_grad():
+            model.opacity_logits.fill_(2.0)
+        density.after_step(29)
+        assert model.opacity_logits.tolist() == [2.0] * 3
+
+
+class TestPhotographs:
+    def test_each_comes_once_before_any_comes_again_and_a_step_has_one_time(self, balls: Scene) -> None:
+        scene = balls.training()
+        photographs = Photographs(scene, 1000, 2, np.random.default_rng(0))
+        seen: list[tuple[str, float]] = []
+        while len(seen) < len(photographs):
+            step = photographs.next()
+            assert len({view.time for view in step}) == 1
+            seen += [(view.camera.name, view.time) for view in step]
+        assert len(set(seen)) == len(seen) == 5 * scene.n_frames
+        assert {time for _, time in seen} >= {0.0, 1.0}
+
+    def test_they_are_shrunk_with_their_cameras(self, balls: Scene) -> None:
+        scene = balls.training()
+        photograph = Photographs(scene, 48, 1, np.random.default_rng(0)).photograph(scene.train[0], 0)
+        assert photograph.image.shape == (32, 48, 3) == (photograph.camera.height, photograph.camera.width, 3)
+        assert photograph.camera.K[0, 0] == pytest.approx(scene.cameras[scene.train[0]].K[0, 0] / 2)
+        assert photograph.image.mean() == pytest.approx(scene.image(scene.train[0], 0).mean(), abs=1)
+
+    def test_times_are_true_ones(self, balls: Scene) -> None:
+        scene = balls.training()
+        shares = [unit_time(scene, t) for t in scene.times]
+        np.testing.assert_allclose(np.diff(shares) / np.diff(scene.times), 1 / (scene.times[-1] - scene.times[0]))
+        assert np.ptp(np.diff(shares)) > 0.01  # the steps of this scene are uneven
+
+
+class TestStart:
+    def test_hull_points_lie_on_the_balls_of_their_frame(self, balls: Scene) -> None:
+        scene = balls.training()
+        start = hull_points(scene, 60 * scene.n_frames)
+        for t in range(scene.n_frames):
+            points = start.positions[start.frame == t]
+            assert 0 < len(points) <= 60
+            distance = np.linalg.norm(points[:, None] - ball_centers(scene.times[t])[None], axis=2).min(axis=1)
+            assert np.median(distance) < 0.12  # radii are .06 to .10 m, and hulls of five views a little larger
+
+    def test_the_fullest_frame_alone_may_give_them(self, balls: Scene) -> None:
+        start = hull_points(balls.training(), 100, largest_only=True)
+        assert len(start) == 100
+        assert len(set(start.frame.tolist())) == 1
+
+    def test_static_points_have_the_colours_and_places_of_the_floor(self, balls: Scene) -> None:
+        start = static_points(balls.training(), 300, "pixels", np.random.default_rng(0))
+        assert 100 < len(start) <= 300
+        assert (start.frame == -1).all()
+        both = joined(start, hull_points(balls.training(), 40))
+        assert len(both) > len(start)
+
+    def test_colours_are_those_of_the_photographs(self, balls: Scene) -> None:
+        colors = hull_points(balls.training(), 400).colors
+        assert np.median(colors[:, 2] - colors[:, 0]) > 0.2  # the balls are blue
+
+
+class TestLiquid:
+    @pytest.fixture
+    def fitted(self, balls: Scene) -> MixedFitted:
+        """Gaussians at the balls of the first frame, and some on the floor below."""
+        balls_, floor = ball_centers(balls.times[0]), np.array([[0.3, -0.3, 0.3], [-0.4, -0.3, 0.2]])
+        return MixedFitted(Table(np.concatenate([balls_, floor]), opacity=0.95), balls.training())
+
+    def test_it_is_what_lies_inside_all_silhouettes(self, fitted: MixedFitted) -> None:
+        assert fitted.liquid(0).tolist() == [True, True, True, False, False]
+        particles = fitted.particles()
+        assert particles is not None
+        assert particles.active[0].all()
+        assert particles.active.shape[1] == 3  # what is never liquid is no particle
+
+    def test_opacity_is_of_the_liquid_alone(self, fitted: MixedFitted, balls: Scene) -> None:
+        camera = balls.cameras[balls.test[0]]
+        render = fitted.render(camera, float(balls.times[0]))
+        (floor,), _ = camera.project(np.array([[0.3, -0.3, 0.3]]))
+        column, row = floor.astype(int)
+        if 0 <= column < camera.width and 0 <= row < camera.height:
+            assert render.rgb[row, column].mean() > 0.2
+            assert render.alpha[row, column] < 0.05
+        (ball,), _ = camera.project(ball_centers(balls.times[0])[:1])
+        assert render.alpha[int(ball[1]), int(ball[0])] > 0.8
+
+
+def test_the_gain_of_the_last_quarter_is_told() -> None:
+    assert History(np.linspace(10, 18, 801, dtype=np.float32)).gained_in_last_quarter() == pytest.approx(2, abs=0.02)
+    assert History(np.full(3, 20, np.float32)).gained_in_last_quarter() == 0

@@ -1,0 +1,73 @@
+"""A NeuroFluid scene as downloaded through every command: looked over, run, scored and tabled, without conversion."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splashbench.cli.main import main
+
+FEW_STEPS = ["--set", "iterations=10", "--set", "anchors=200", "--set", "longest_side=32"]
+
+
+def _json(capsys: pytest.CaptureFixture[str], *words: object) -> Any:
+    capsys.readouterr()
+    assert main([*map(str, words), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture(scope="module")
+def runs(watersphere: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Submissions of a method and of the controls."""
+    folder = tmp_path_factory.mktemp("runs")
+    options = {"hull_points": ["--preset", "quick"], "nothing": ["--preset", "quick", *FEW_STEPS], "oracle": []}
+    for method, words in options.items():
+        timing = [] if method == "oracle" else ["--timing-frames", "0"]
+        assert main(["run", method, str(watersphere), str(folder / method), *words, *timing]) == 0
+    return {method: folder / method for method in options}
+
+
+def test_scene_commands_read_it(watersphere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    info = _json(capsys, "scene", "info", watersphere)
+    assert (info["layout"], info["frames"], info["times_source"]) == ("neurofluid", 6, "neurofluid")
+    assert (info["train"], info["test"]) == (["view_1", "view_2", "view_3", "view_4"], ["view_5"])
+    assert _json(capsys, "scene", "check", watersphere)["ok"] is True
+
+
+def test_runs_are_scored_against_the_held_out_view_and_the_particles(
+    watersphere: Path, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in runs.values():
+        assert _json(capsys, "check", path, "--scene", watersphere)["ok"] is True
+        assert {folder.name for folder in (path / "renders").iterdir()} == {"view_5"}
+    results = tmp_path / "results"
+    words = [*runs.values(), "--scene", watersphere, "--out", results, "--reference", runs["nothing"]]
+    scored = _json(capsys, "score", *words)
+    metrics = {result["method"]: result["metrics"] for result in scored["results"]}
+    # The truth itself is perfect: images, and what the particles of the simulation are compared with.
+    oracle = metrics["oracle"]
+    assert (oracle["psnr"], oracle["miou"], oracle["jitter_error"]) == (100.0, 1.0, 0.0)
+    assert oracle["ssim"] == pytest.approx(1.0)
+    assert oracle["sdf_iou"] == 1.0
+    assert oracle["velocity_epe"] == pytest.approx(0.0, abs=1e-6)
+    # The ball falls freely, so its energy never rises: gravity, scale and times are known.
+    assert oracle["delta_e"] == pytest.approx(0.0, abs=0.01)
+    # Four views on an arc see the ball: the hull lies where it is, and its colours are near.
+    hull = metrics["hull_points"]
+    assert hull["miou"] > 0.8
+    assert hull["psnr"] > metrics["nothing"]["psnr"] + 10
+    assert hull["sdf_iou"] > 0.5
+    assert metrics["nothing"]["miou"] == 0.0
+
+    assert main(["leaderboard", str(results), str(tmp_path / "board"), "--with-paper"]) == 0
+    text = (tmp_path / "board" / "leaderboard.md").read_text()
+    head = next(line for line in text.splitlines() if line.startswith("| Method | Preset | Seeds | Status"))
+    assert all(name in head for name in ("PSNR (dB) ↑", "SSIM ↑", "Jitter error ↓"))
+    # Table 3 of the paper, below our own and apart from it.
+    own, paper = text.split("As the paper reports it (Table 3")
+    assert "| splashsplat | 27.94 | 0.8761 | 0.2329 | 0.0099 |" in paper
+    assert "27.94" not in own
+    assert "27.94" not in (tmp_path / "board" / "leaderboard.csv").read_text()
+    assert main(["leaderboard", str(results), str(tmp_path / "own")]) == 0
+    assert "As the paper reports it" not in (tmp_path / "own" / "leaderboard.md").read_text()
