@@ -27,13 +27,17 @@ _MARK = "SPLASHBENCH_RUN"
 
 @dataclass
 class Watched:
-    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory, time."""
+    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory, time.
+
+    strays: processes that had left its process group and were there still; they were killed.
+    """
 
     exit_code: int
     timed_out: bool
     peak_memory_bytes: int
     log_tail: list[str]
     seconds: float
+    strays: list[str]
 
 
 def run_watched(
@@ -108,9 +112,9 @@ def watch(
     finally:
         # Also when the user interrupts: a method may have started processes of its own.
         _kill_group(process)
-        _kill_marked(mark)
+        strays = _kill_marked(mark, process.pid)
         bar.close()
-    return Watched(process.wait(), timed_out, peak, _tail(log), seconds)
+    return Watched(process.wait(), timed_out, peak, _tail(log), seconds, strays)
 
 
 def _tree_memory(pid: int) -> int:
@@ -135,14 +139,18 @@ def _kill_group(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _kill_marked(mark: str) -> None:
-    """Kill what left the process group (a daemon of the method's, say): whoever inherited `mark`."""
+def _kill_marked(mark: str, group: int) -> list[str]:
+    """Kill whoever inherited `mark`; a line for each that had left the process group, as daemons do."""
     import psutil
 
+    strays = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error, OSError):
             if process.environ().get(_MARK) == mark:
+                if os.getpgid(process.pid) != group:
+                    strays.append(f"{process.name()} (process {process.pid})")
                 process.kill()
+    return strays
 
 
 class _ProgressReader:

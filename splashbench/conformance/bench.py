@@ -27,7 +27,7 @@ class Bench:
     Attributes:
         touches: what the method touched of the scene, or wrote elsewhere, in any process so far.
         opened: test views that were opened by any process. watched: whether none can have been missed.
-        left: processes that outlived their run, each with the run's name.
+        left: processes that left their run's process group and outlived it, each with the run's name.
     """
 
     def __init__(self, work: Path) -> None:
@@ -64,7 +64,8 @@ class Bench:
             touched=str(work / "touched"),
         )
         write_model(work / "order.json", order)
-        with self.process(f"the process to {do}"), Opening(list(place.baits)) as opening:
+        what = f"the process to {do}"
+        with self.process(what), Opening(list(place.baits)) as opening:
             watched = run_watched(
                 ["-m", "splashbench.conformance.child", str(work / "order.json")],
                 log=work / "log",
@@ -73,6 +74,7 @@ class Bench:
                 timeout_seconds=subject.timeout_seconds,
                 keep_bar=False,
             )
+        self.left += [f"{line}, after {what}" for line in watched.strays]
         self.touches |= dict.fromkeys(read_touched(work / "touched"))
         self.opened |= dict.fromkeys(opening.seen)
         self.watched &= opening.complete or not place.baits

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from splashbench.adapter.discovery import ORACLE, load_method
+from splashbench.adapter.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.adapter.runner import run_method
 from splashbench.conformance import scenes
 from splashbench.conformance.bench import Bench
@@ -59,8 +59,8 @@ class Trial:
         device: str,
         timeout_seconds: float,
     ) -> None:
-        if name == ORACLE:
-            raise SplashbenchError("the oracle is written by the harness and is no method; test another")
+        if name in (ORACLE, EXTERNAL):
+            raise SplashbenchError(f"{name} is no method that could be tested; see `splashbench methods list`")
         self.method = load_method(name)
         # A file given by a relative path is the same one wherever a process starts.
         self.name = f"{Path(name.rpartition(':')[0]).resolve()}:{name.rpartition(':')[2]}" if ":" in name else name

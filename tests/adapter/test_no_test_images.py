@@ -10,10 +10,20 @@ from splashbench.scene import Scene
 from splashbench.submission import Status, Submission
 
 PEEKING = Path(__file__).parents[1] / "conformance" / "methods_for_conformance.py"
+_SPARSE = {"iterations": 20, "static_points": 300}
 SMALL: dict[str, dict[str, object]] = {
     "nothing": {"iterations": 20, "anchors": 300},
     "scaffold_gs": {"iterations": 20, "anchors": 300},
     "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
+    "deformable_3dgs": {
+        "iterations": 20,
+        "static_points": 300,
+        "hull_points": 200,
+        "most": 700,
+        "width": 16,
+        "depth": 4,
+    },
+    "spacetime_gaussians": {**_SPARSE, "hull_points": 400, "most": 1500},
 }
 
 
@@ -48,6 +58,8 @@ def _quick(name: str) -> str | None:
         "nothing",
         pytest.param("scaffold_gs", marks=pytest.mark.slow),
         pytest.param("splashsplat", marks=pytest.mark.slow),
+        pytest.param("deformable_3dgs", marks=pytest.mark.slow),
+        pytest.param("spacetime_gaussians", marks=pytest.mark.slow),
     ],
 )
 def test_a_run_is_the_same_without_test_views(

@@ -6,6 +6,7 @@ from splashbench.adapter.discovery import registered
 from splashbench.conformance import Report, conform
 from splashbench.conformance.checks import CHECKS
 
+_SPARSE = {"iterations": 20, "static_points": 300}
 #: Small enough for a test; on top of preset quick.
 SETTINGS: dict[str, dict[str, object]] = {
     "hull_points": {},
@@ -16,6 +17,16 @@ SETTINGS: dict[str, dict[str, object]] = {
     "spacetime_gaussians": {"iterations": 12, "static_points": 300, "hull_points": 200},
     "spacetime_gaussians_lite": {"iterations": 12, "static_points": 300, "hull_points": 200},
     "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
+    "deformable_3dgs": {
+        "iterations": 20,
+        "static_points": 300,
+        "hull_points": 200,
+        "most": 700,
+        "width": 16,
+        "depth": 4,
+    },
+    "spacetime_gaussians": {**_SPARSE, "hull_points": 400, "most": 1500},
+    "spacetime_gaussians_lite": {**_SPARSE, "hull_points": 400, "most": 1500},
 }
 # A dozen starts of PyTorch, three of them to be stopped, are for `make test-all`.
 _STARTS = {"time_limit", "signals", "processes", "one_frame", "no_liquid", "other_seed"}
