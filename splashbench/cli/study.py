@@ -39,8 +39,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     ablate.add_argument("spec", metavar="SPEC", help="a TOML file, or the name of a study that is shipped")
     ablate.add_argument("out", type=Path, metavar="OUT", help="folder of the study; runs that are in it are kept")
-    ablate.add_argument("--scenes", nargs="+", action="extend", default=[], metavar="SCENE", help="folders of scenes, for the spec's")
-    ablate.add_argument("--seeds", nargs="+", action="extend", type=_not_negative, default=[], metavar="SEED", help="for the spec's")
+    ablate.add_argument(
+        "--scenes", nargs="+", action="extend", default=[], metavar="SCENE", help="folders of scenes, for the spec's"
+    )
+    ablate.add_argument(
+        "--seeds", nargs="+", action="extend", type=_not_negative, default=[], metavar="SEED", help="for the spec's"
+    )
     ablate.add_argument(
         "--set",
         action="append",

@@ -13,9 +13,6 @@ SETTINGS: dict[str, dict[str, object]] = {
     "nearest_camera": {},
     "nothing": {"iterations": 20, "anchors": 300},
     "scaffold_gs": {"iterations": 20, "anchors": 300},
-    "deformable_3dgs": {"iterations": 12, "static_points": 300, "hull_points": 200, "width": 16, "depth": 4},
-    "spacetime_gaussians": {"iterations": 12, "static_points": 300, "hull_points": 200},
-    "spacetime_gaussians_lite": {"iterations": 12, "static_points": 300, "hull_points": 200},
     "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
     "deformable_3dgs": {
         "iterations": 20,
