@@ -9,6 +9,7 @@ that the view shows. They appear at the photograph's time.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from torch import Tensor
 from splashbench.scene import Camera
 
 PATCH = 8
-_PER_RAY = 4
+PER_RAY = 4
 _OPACITY = 0.1
 # Photographs among which the worst is looked for: all of a long recording would take longer than a round of the fit.
 _LOOKED_AT = 16
@@ -56,7 +57,7 @@ class GuidedDensity:
         self._density.after_step(step)
         if self._from <= step < self._until and (step - self._from) % self._config.guided_every == 0:
             room = self._config.most - len(self._model.positions)
-            patches = min(self._config.guided_patches, room // _PER_RAY)
+            patches = min(self._config.guided_patches, room // PER_RAY)
             if patches > 0:
                 photograph, error, depths = self._worst()
                 self._density.append(self._gaussians(photograph, error, depths, patches))
@@ -83,25 +84,13 @@ class GuidedDensity:
         self, photograph: Photograph, error: NDArray[np.float32], depths: NDArray[np.float32], patches: int
     ) -> dict[str, Tensor]:
         """Rows of all tables for Gaussians along the rays of the worst patches; none where the view shows nothing."""
-        camera = photograph.camera
-        rows, columns = (size // PATCH for size in error.shape)
-        if len(depths) == 0 or rows == 0 or columns == 0:
-            patches = 0
-        blocks = error[: rows * PATCH, : columns * PATCH].reshape(rows, PATCH, columns, PATCH).mean(axis=(1, 3))
-        worst = np.argsort(-blocks, axis=None, kind="stable")[:patches].repeat(_PER_RAY)
-        v, u = worst // max(columns, 1) * PATCH + PATCH // 2, worst % max(columns, 1) * PATCH + PATCH // 2
-        count = len(worst)
-        near, far = np.quantile(depths, [_NEAR, _FAR]) if count else (1.0, 1.0)
-        depth = self._rng.uniform(near, far, count)
-        ray = rays(camera)[v, u].astype(np.float64)
-        forward = ray[:, 3:] @ camera.w2c[2, :3]
-        positions = ray[:, :3] + ray[:, 3:] * (depth / forward)[:, None]
-        colors = torch.from_numpy(photograph.image[v, u] / np.float32(255))
+        placed = along_worst_rays(photograph, error, depths, patches, self._rng)
+        count = len(placed.positions)
+        colors = torch.from_numpy(placed.colors)
         new = {name: torch.zeros(count, *self._model.get_parameter(name).shape[1:]) for name in self._model.rows}
-        new["positions"] = torch.from_numpy(positions.astype(np.float32))
+        new["positions"] = torch.from_numpy(placed.positions)
         new["quaternions"][:, 0] = 1
-        size = PATCH / 2 * depth / camera.K[0, 0]
-        new["log_scales"] += torch.from_numpy(np.log(size).astype(np.float32))[:, None]
+        new["log_scales"] += torch.from_numpy(np.log(placed.sizes))[:, None]
         new["opacity_logits"] += math.log(_OPACITY / (1 - _OPACITY))
         new["times"] += photograph.time
         new["log_widths"] += self._config.hull_log_width
@@ -109,3 +98,36 @@ class GuidedDensity:
         if self._model.full:
             new["features"] = colors
         return new
+
+
+class Placed(NamedTuple):
+    """Places of new Gaussians: positions [n, 3] and sizes [n] in scene units, colors [n, 3] in [0, 1]; float32."""
+
+    positions: NDArray[np.float32]
+    sizes: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+def along_worst_rays(
+    photograph: Photograph,
+    error: NDArray[np.float32],
+    depths: NDArray[np.float32],
+    patches: int,
+    rng: np.random.Generator,
+) -> Placed:
+    """Places along the rays of the `patches` with the largest `error` [H, W], at depths within `depths` [M]."""
+    camera = photograph.camera
+    rows, columns = (size // PATCH for size in error.shape)
+    if len(depths) == 0:
+        patches = 0
+    blocks = error[: rows * PATCH, : columns * PATCH].reshape(rows, PATCH, columns, PATCH).mean(axis=(1, 3))
+    worst = np.argsort(-blocks, axis=None, kind="stable")[:patches].repeat(PER_RAY)
+    v, u = worst // max(columns, 1) * PATCH + PATCH // 2, worst % max(columns, 1) * PATCH + PATCH // 2
+    near, far = np.quantile(depths, [_NEAR, _FAR]) if len(worst) else (1.0, 1.0)
+    depth = rng.uniform(near, far, len(worst))
+    ray = rays(camera)[v, u].astype(np.float64)
+    forward = ray[:, 3:] @ camera.w2c[2, :3]
+    positions = ray[:, :3] + ray[:, 3:] * (depth / forward)[:, None]
+    sizes = PATCH / 2 * depth / camera.K[0, 0]
+    colors = photograph.image[v, u] / np.float32(255)
+    return Placed(positions.astype(np.float32), sizes.astype(np.float32), colors)

@@ -10,7 +10,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from splashbench_methods.gaussian_splatting.mixed import MixedFitted
+from splashbench_methods.gaussian_splatting.photographs import Photographs
 from splashbench_methods.spacetime_gaussians import SpacetimeGaussians, SpacetimeGaussiansLite
+from splashbench_methods.spacetime_gaussians.guided import PATCH, PER_RAY, along_worst_rays
 from splashbench_methods.spacetime_gaussians.model import SpacetimeModel, rays
 from splashbench_methods.spacetime_gaussians.settings import Settings
 
@@ -126,26 +128,30 @@ class TestFit:
 
 
 class TestGuidedSampling:
-    def test_it_places_gaussians_where_nothing_is_and_the_view_errs(self, balls: Scene, tmp_path: Path) -> None:
-        settings = {"iterations": 4, "hull_points": 0, "grow_from": 1.0, "prune_until": 0.0}
-        without = fit(SpacetimeGaussiansLite, balls, tmp_path, **settings)
-        guided = {"guided_until": 0.25, "guided_patches": 3, "guided_every": 10}
-        model = fit(SpacetimeGaussiansLite, balls, tmp_path, **settings, **guided).model
-        count = len(without.model.positions)
-        new = model.positions.detach().numpy()[count:]
-        assert len(new) == 12  # four on each of three rays
-        time = float(model.times[count])
-        t = int(np.abs((balls.times - balls.times[0]) / np.ptp(balls.times) - time).argmin())
-        # Without points of the hull, what is wrong is where the balls are.
-        hits = []
-        for name in balls.train:
-            pixels, _ = balls.cameras[name].project(new)
-            inside = ((pixels >= 0) & (pixels < [96, 64])).all(axis=1)
-            column, row = np.clip(pixels.astype(int), 0, [95, 63]).T
-            grown = balls.mask(name, t)
-            near = [grown[max(r - 6, 0) : r + 7, max(c - 6, 0) : c + 7].any() for r, c in zip(row, column)]
-            hits.append((np.array(near) & inside).mean())
-        assert max(hits) > 0.9
+    def test_it_places_gaussians_on_the_rays_of_the_worst_patches(self, balls: Scene) -> None:
+        photographs = Photographs(balls.training(), 1000, 1, np.random.default_rng(0))
+        photograph = photographs.photograph("2", 3)
+        error = np.full((64, 96), 0.1, np.float32)
+        error[8:16, 24:32], error[40:48, 80:88] = 0.9, 0.5
+        depths = np.linspace(2, 4, 101, dtype=np.float32)
+        placed = along_worst_rays(photograph, error, depths, 2, np.random.default_rng(0))
+        pixels, depth = photograph.camera.project(placed.positions)
+        np.testing.assert_allclose(pixels, np.repeat([[28.5, 12.5], [84.5, 44.5]], PER_RAY, axis=0), atol=1e-3)
+        assert depth.min() >= 2
+        assert depth.max() <= 4
+        assert np.ptp(depth) > 0.5
+        np.testing.assert_allclose(placed.colors[0], photograph.image[12, 28] / 255, rtol=1e-6)
+        half_a_patch = placed.sizes * photograph.camera.K[0, 0] / depth
+        np.testing.assert_allclose(half_a_patch, PATCH / 2, rtol=1e-5)
+        assert len(along_worst_rays(photograph, error, depths[:0], 2, np.random.default_rng(0)).positions) == 0
+
+    def test_new_gaussians_have_the_time_of_their_photograph(self, balls: Scene, tmp_path: Path) -> None:
+        settings = {"iterations": 2, "hull_points": 0, "grow_from": 1.0, "prune_until": 0.0}
+        count = len(fit(SpacetimeGaussiansLite, balls, tmp_path, **settings).model.positions)
+        guided = {"guided_until": 0.5, "guided_patches": 3, "guided_every": 10}
+        times = fit(SpacetimeGaussiansLite, balls, tmp_path, **settings, **guided).model.times.detach()[count:]
+        assert len(times) == 3 * PER_RAY
+        assert len(times.round(decimals=3).unique()) == 1
 
     def test_it_keeps_to_the_limit(self, balls: Scene, tmp_path: Path) -> None:
         settings = {"iterations": 2, "hull_points": 0, "grow_from": 1.0, "most": 305, "guided_until": 1.0}
