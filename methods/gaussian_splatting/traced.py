@@ -9,6 +9,7 @@ refuses every other.
 from __future__ import annotations
 
 import pickletools
+import warnings
 import zipfile
 import zlib
 from dataclasses import dataclass, field
@@ -30,7 +31,7 @@ _EMPTY = {"EMPTY_TUPLE": tuple, "EMPTY_DICT": dict, "EMPTY_LIST": list}
 _PLAIN = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _VALUES = ("BINUNICODE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT")
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_DAMAGED = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, EOFError, MemoryError)
+_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, EOFError, MemoryError, Warning)
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,9 @@ def traced_weights(path: Path, max_bytes: int) -> dict[str, NDArray[np.floating]
             program = next(name for name in sizes if name.count("/") == 1 and name.endswith("/data.pkl"))
             if sizes[program] > _MAX_PROGRAM_BYTES:
                 raise SplashbenchError(f"{path}: its list of weights is too long; give the file as the code saved it")
-            found = _arrays(_read(archive.read(program)))
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # of pickletools, at names that are none
+                found = _arrays(_read(archive.read(program)))
             storages: dict[str, NDArray] = {}
             arrays = {}
             for name, arguments in found.items():
