@@ -35,10 +35,11 @@ def track(iterable: Iterable[T], description: str, total: int | None = None) -> 
 class Bar:
     """A bar that follows a fraction in [0, 1] reported from elsewhere (a method in its child process).
 
-    Without a terminal it prints a line every ten seconds instead: logs are read as lines.
+    Without a terminal it prints a line every ten seconds instead: logs are read as lines. With `keep` false it leaves
+    no line behind on the terminal, for bars between lines of other text.
     """
 
-    def __init__(self, description: str) -> None:
+    def __init__(self, description: str, keep: bool = True) -> None:
         self._description = description
         self._bar: Any = None
         self._told = time.monotonic()
@@ -46,7 +47,7 @@ class Bar:
             from tqdm import tqdm
 
             form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-            self._bar = tqdm(total=1.0, desc=description, file=sys.stderr, ncols=90, bar_format=form)
+            self._bar = tqdm(total=1.0, desc=description, file=sys.stderr, ncols=90, bar_format=form, leave=keep)
 
     def update(self, fraction: float, message: str = "") -> None:
         """Move to `fraction` (never backwards) and show `message` behind the bar."""

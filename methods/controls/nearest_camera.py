@@ -29,6 +29,7 @@ class NearestCamera(Method):
     control: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: MethodConfig, run: Run) -> Fitted:
+        run.progress(1.0, "nothing to fit: the training views are the model")
         return NearestView(scene)
 
     def load(self, directory: Path, scene: TrainingScene) -> Fitted:

@@ -23,7 +23,7 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 700, "views_per_step": 2, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
+            "iterations": 1000, "views_per_step": 2, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
             "color_factor": 4.0, "network_factor": 2.0,
         },
         "paper": {

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-_SHORT_LAST = 0.01
+_SHORT_LAST = 0.025
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Rate:
         return cls(value, value)
 
     def short(self) -> Rate:
-        """The same at first, for a short fit: it falls to a hundredth until the end."""
+        """The same at first, for a short fit: it falls to a fortieth until the end."""
         return Rate(self.first, self.first * _SHORT_LAST, begin=self.begin)
 
     def at(self, done: float) -> float:

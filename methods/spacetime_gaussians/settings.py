@@ -20,7 +20,7 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 600, "hull_points": 20_000, "most": 30_000, "rate_factor": 4.0, "color_factor": 4.0,
+            "iterations": 800, "hull_points": 20_000, "most": 30_000, "rate_factor": 4.0, "color_factor": 4.0,
         },
         "paper": {
             "iterations": 30_000, "views_per_step": 2, "static": "points", "static_points": 100_000,

@@ -13,21 +13,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
-import numpy as np
-
-from splashbench.adapter.contract import Fitted, Method, Render, Run
+from splashbench.adapter.contract import Fitted, Method, Run
 from splashbench.adapter.discovery import load_method
 from splashbench.adapter.importers import Importer, load_importer
 from splashbench.adapter.messages import DISK_FULL_EXIT, Failure, Outcome, Request
+from splashbench.adapter.returned import check_geometry, check_particles, checked_render
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import raise_if_disk_full, read_model, write_model
 from splashbench.processes import end_with_parent
-from splashbench.scene import Camera, Particles, Scene, SignedDistance, TrainingScene
+from splashbench.scene import Camera, Scene, TrainingScene
 from splashbench.submission import Status, to_8bit, write_view
 from splashbench.submission.exr import write_exr
 
 WARM_UP_FRAMES = 10
-_OVERSHOOT = 0.5
 
 
 def main(request_path: str) -> int:
@@ -130,7 +128,8 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
         report = _reporter(stream)
         for i, (camera, t, time) in enumerate(views):
             _reset_primitive_counter()
-            render = _checked(fitted.render(camera, time), camera, t)
+            where = f"camera {camera.name}, timestep {t}"
+            render = checked_render(fitted.render(camera, time), camera, where)
             counts.append(_primitive_count())
             write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
             if request.exr:
@@ -139,13 +138,11 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
     # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
     particles = fitted.particles() if request.times is None else None
     if particles is not None:
-        if particles.n_frames != scene.n_frames:
-            raise Failure(Status.INCOMPLETE, f"particles cover {particles.n_frames} of {scene.n_frames} timesteps")
-        _check_finite(particles)
+        check_particles(particles, scene.n_frames)
         particles.save(output / "particles.npz")
     geometry = fitted.signed_distance() if request.times is None else None
     if geometry is not None:
-        _check_geometry(geometry, scene.n_frames)
+        check_geometry(geometry, scene.n_frames)
         geometry.save(output / "geometry.npz")
     known = [count for count in counts if count is not None]
     return Outcome(
@@ -160,41 +157,6 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
 def _time(scene: TrainingScene, camera: Camera, t: int) -> float:
     """When the photograph that the view is compared with was taken, seconds."""
     return float(scene.camera_times[camera.name][t])
-
-
-def _checked(render: Render, camera: Camera, t: int) -> Render:
-    """`render`, after checking type, size and finiteness."""
-    where = f"camera {camera.name}, timestep {t}"
-    if not isinstance(render, Render):
-        raise Failure(Status.INCOMPLETE, f"{where}: render() returned {type(render).__name__}, not a Render")
-    rgb, alpha = np.asarray(render.rgb), np.asarray(render.alpha)
-    wanted = (camera.height, camera.width)
-    if rgb.shape != (*wanted, 3) or alpha.shape != wanted:
-        raise Failure(
-            Status.WRONG_SIZE, f"{where}: rgb is {rgb.shape} and alpha {alpha.shape}; the view is {wanted} pixels"
-        )
-    if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
-        raise Failure(Status.NOT_FINITE, f"{where}: the render has NaN or infinite pixels")
-    for name, values in (("rgb", rgb), ("alpha", alpha)):
-        # A little over is clipped; integers, or 0 to 255, are a mistake that clipping would hide as a white image.
-        if values.dtype.kind != "f" or values.min() < -_OVERSHOOT or values.max() > 1 + _OVERSHOOT:
-            found = f"{values.dtype} from {values.min():g} to {values.max():g}"
-            raise Failure(Status.OUT_OF_RANGE, f"{where}: {name} is {found}, not floats in [0, 1]")
-    return Render(rgb, alpha)
-
-
-def _check_finite(particles: Particles) -> None:
-    for name in ("positions", "velocities"):
-        values = getattr(particles, name)
-        if values is not None and not np.isfinite(values).all():
-            raise Failure(Status.NOT_FINITE, f"particles: {name} has NaN or infinite entries")
-
-
-def _check_geometry(geometry: SignedDistance, n_frames: int) -> None:
-    if not isinstance(geometry, SignedDistance):
-        raise Failure(Status.INCOMPLETE, f"signed_distance() returned {type(geometry).__name__}, not a SignedDistance")
-    if geometry.n_frames != n_frames:
-        raise Failure(Status.INCOMPLETE, f"the signed distance covers {geometry.n_frames} of {n_frames} timesteps")
 
 
 def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | None:

@@ -27,20 +27,37 @@ _MARK = "SPLASHBENCH_RUN"
 
 @dataclass
 class Watched:
-    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory, time."""
+    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory, time.
+
+    strays: processes that had left its process group and were there still; they were killed.
+    """
 
     exit_code: int
     timed_out: bool
     peak_memory_bytes: int
     log_tail: list[str]
     seconds: float
+    strays: list[str]
 
 
 def run_watched(
-    arguments: list[str], *, log: Path, progress: Path, label: str, timeout_seconds: float | None
+    arguments: list[str],
+    *,
+    log: Path,
+    progress: Path,
+    label: str,
+    timeout_seconds: float | None,
+    keep_bar: bool = True,
 ) -> Watched:
     """Run `python ARGUMENTS`; see `watch`."""
-    return watch([sys.executable, *arguments], log=log, progress=progress, label=label, timeout_seconds=timeout_seconds)
+    return watch(
+        [sys.executable, *arguments],
+        log=log,
+        progress=progress,
+        label=label,
+        timeout_seconds=timeout_seconds,
+        keep_bar=keep_bar,
+    )
 
 
 def watch(
@@ -51,12 +68,13 @@ def watch(
     label: str,
     timeout_seconds: float | None,
     tell_log: bool = False,
+    keep_bar: bool = True,
 ) -> Watched:
     """Run `command` in a process group of its own until it ends or its time is up.
 
-    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, and with
-    `tell_log` the log's last line is shown where there are none. Memory is the sum of resident sizes over the process
-    tree, and the time that the process took is known, to 50 ms.
+    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, which stays
+    on the terminal with `keep_bar`, and with `tell_log` the log's last line is shown where there are none. Memory is
+    the sum of resident sizes over the process tree, and the time that the process took is known, to 50 ms.
     """
     environment = dict(os.environ)
     environment[_MARK] = mark = uuid.uuid4().hex
@@ -72,7 +90,7 @@ def watch(
             env=environment,
         )
     start, peak, timed_out = time.monotonic(), 0, False
-    bar = Bar(label)
+    bar = Bar(label, keep_bar)
     reader = _ProgressReader(progress)
     told, fraction = start, 0.0
     try:
@@ -94,9 +112,9 @@ def watch(
     finally:
         # Also when the user interrupts: a method may have started processes of its own.
         _kill_group(process)
-        _kill_marked(mark)
+        strays = _kill_marked(mark, process.pid)
         bar.close()
-    return Watched(process.wait(), timed_out, peak, _tail(log), seconds)
+    return Watched(process.wait(), timed_out, peak, _tail(log), seconds, strays)
 
 
 def _tree_memory(pid: int) -> int:
@@ -121,14 +139,18 @@ def _kill_group(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _kill_marked(mark: str) -> None:
-    """Kill what left the process group (a daemon of the method's, say): whoever inherited `mark`."""
+def _kill_marked(mark: str, group: int) -> list[str]:
+    """Kill whoever inherited `mark`; a line for each that had left the process group, as daemons do."""
     import psutil
 
+    strays = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error, OSError):
             if process.environ().get(_MARK) == mark:
+                if os.getpgid(process.pid) != group:
+                    strays.append(f"{process.name()} (process {process.pid})")
                 process.kill()
+    return strays
 
 
 class _ProgressReader:

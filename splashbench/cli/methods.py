@@ -1,16 +1,18 @@
-"""`splashbench methods list|show`: which methods there are, and what can be set on them."""
+"""`splashbench methods list|show|test`: which methods there are, what can be set on them, and whether one is sound."""
 
 from __future__ import annotations
 
 import argparse
 from typing import Any
 
+from splashbench.cli import methods_test
 from splashbench.cli.output import add_json, emit, table
 
 _EPILOG = """\
 examples:
   splashbench methods list
   splashbench methods show splashsplat              presets and settings
+  splashbench methods test my_method.py:MyMethod    does it keep the contract?
 """
 
 
@@ -18,12 +20,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
     parser = subparsers.add_parser(
         "methods",
-        help="list the methods, show one's settings",
+        help="list the methods, show one's settings, test one",
         description="Methods are found through the entry-point group splashbench.methods (CONTRIBUTING.md).",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    actions = parser.add_subparsers(dest="action", metavar="list|show", required=True)
+    actions = parser.add_subparsers(dest="action", metavar="list|show|test", required=True)
     listing = actions.add_parser("list", help="every method installed", description="List every method installed.")
     add_json(listing)
     listing.set_defaults(handler=list_methods)
@@ -31,6 +33,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     show.add_argument("method", help="a name from `splashbench methods list`, or FILE.py:CLASS")
     add_json(show)
     show.set_defaults(handler=show_method)
+    methods_test.register(actions)
 
 
 def _facts(name: str) -> dict[str, Any]:

@@ -45,7 +45,9 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
     parser.add_argument("--seed", type=_not_negative, default=0, help="seed of every random choice (default 0)")
     parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can")
-    parser.add_argument("--timeout", type=_seconds, metavar="SECONDS", help="limit for the fit, and for the rendering")
+    parser.add_argument(
+        "--timeout", type=seconds_above_zero, metavar="SECONDS", help="limit for the fit, and for the rendering"
+    )
     parser.add_argument(
         "--timing-frames",
         type=_not_negative,
@@ -71,7 +73,7 @@ def _not_negative(text: str) -> int:
     return int(text)
 
 
-def _seconds(text: str) -> float:
+def seconds_above_zero(text: str) -> float:
     try:
         seconds = float(text)
     except ValueError:

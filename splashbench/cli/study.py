@@ -39,8 +39,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     ablate.add_argument("spec", metavar="SPEC", help="a TOML file, or the name of a study that is shipped")
     ablate.add_argument("out", type=Path, metavar="OUT", help="folder of the study; runs that are in it are kept")
-    ablate.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="folders of scenes, for the spec's")
-    ablate.add_argument("--seeds", nargs="+", type=_not_negative, default=[], metavar="SEED", help="for the spec's")
+    ablate.add_argument(
+        "--scenes", nargs="+", action="extend", default=[], metavar="SCENE", help="folders of scenes, for the spec's"
+    )
+    ablate.add_argument(
+        "--seeds", nargs="+", action="extend", type=_not_negative, default=[], metavar="SEED", help="for the spec's"
+    )
     ablate.add_argument(
         "--set",
         action="append",
@@ -49,7 +53,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         dest="base",
         help="a setting of every row, as the budget of iterations is; on top of the spec's",
     )
-    ablate.add_argument("--only", nargs="+", metavar="VARIANT", help="run these variants only")
+    ablate.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
     ablate.add_argument("--jobs", type=_positive, default=1, metavar="N", help="runs at once (default 1)")
     ablate.add_argument("--retry", action="store_true", help="run again what failed")
     ablate.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")

@@ -74,7 +74,7 @@ class TestHarmonics:
 def test_a_rate_begins_falls_and_stays() -> None:
     rate = Rate(1.0, 0.01, until=0.5, begin=0.1)
     assert [rate.at(done) for done in (0.05, 0.25, 0.5, 1.0)] == pytest.approx([0, 0.1, 0.01, 0.01])
-    assert Rate.constant(0.3).short().at(1.0) == pytest.approx(0.003)
+    assert Rate.constant(0.3).short().at(1.0) == pytest.approx(0.0075)
 
 
 class Table(DynamicModel):
