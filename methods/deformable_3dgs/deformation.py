@@ -26,17 +26,23 @@ def encode(values: Tensor, octaves: int = OCTAVES) -> Tensor:
 class Deformation(nn.Module):
     """F: positions [N, 3] and a time in [0, 1] to shifts [N, 3], turns [N, 4] and growths [N, 3]; scene units.
 
-    center [3], unit: of the box that the octaves suit, scene units.
+    center [3], unit: of the box that the octaves suit, scene units. With time_features, a small network first turns the
+    time's octaves into so many features, as published for synthetic scenes.
     """
 
     center: Tensor
     unit: Tensor
 
-    def __init__(self, depth: int = 8, width: int = 256) -> None:
+    def __init__(self, depth: int = 8, width: int = 256, time_octaves: int = OCTAVES, time_features: int = 0) -> None:
         super().__init__()
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("unit", torch.ones(()))
-        self._inputs = (3 + 1) * (1 + 2 * OCTAVES)
+        self._time_octaves, times = time_octaves, 1 + 2 * time_octaves
+        self.times: nn.Module = nn.Identity()
+        if time_features:
+            self.times = nn.Sequential(nn.Linear(times, 256), nn.ReLU(), nn.Linear(256, time_features))
+            times = time_features
+        self._inputs = 3 * (1 + 2 * OCTAVES) + times
         self._again = depth // 2
         sizes = [self._inputs] + [width] * (depth - 1)
         self.layers = nn.ModuleList(
@@ -53,9 +59,9 @@ class Deformation(nn.Module):
 
     def forward(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
         positions = (positions - self.center) / self.unit
-        times = positions.new_full((1, 1), time)
         # The time is the same for all: its encoding is worked out once.
-        encoded = torch.cat([encode(positions), encode(times).expand(len(positions), -1)], dim=1)
+        times = self.times(encode(positions.new_full((1, 1), time), self._time_octaves))
+        encoded = torch.cat([encode(positions), times.expand(len(positions), -1)], dim=1)
         hidden = encoded
         for i, layer in enumerate(self.layers):
             if i == self._again + 1:

@@ -65,13 +65,17 @@ class DeformableModel(DynamicModel):
             model.constant.copy_(harmonics.constant_of(torch.from_numpy(start.colors)))
         return model
 
+    def turned(self, quaternions: Tensor) -> Tensor:
+        """Axes [N, 3, 3] of Gaussians with these quaternions [N, 4], after the network's turn."""
+        return rotation_matrices(quaternions)
+
     def at(self, time: float) -> State:
         quaternions = nn.functional.normalize(self.quaternions, dim=1)
         scales, means = torch.exp(self.log_scales), self.positions
         if self.deforms:
             shift, turn, growth = self.deformation(self.positions.detach(), time)
             means, quaternions, scales = means + shift, quaternions + turn, scales + growth
-        factors = rotation_matrices(quaternions) * scales[:, None]
+        factors = self.turned(quaternions) * scales[:, None]
         return State(means, factors, torch.sigmoid(self.opacity_logits))
 
     def splats(self, state: State, camera: Camera) -> Splats:

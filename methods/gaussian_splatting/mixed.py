@@ -29,16 +29,33 @@ MODEL_FILE = "model.npz"
 _HISTORY_FILE = "history.json"
 
 
+class _Masked:
+    """The masks of `scene` as `cameras` see them, see observe.silhouettes.MaskedScene."""
+
+    def __init__(self, scene: TrainingScene, cameras: dict[str, Camera]) -> None:
+        self.name, self.train, self.n_frames, self.cameras = scene.name, scene.train, scene.n_frames, cameras
+        self.mask = scene.mask
+
+
 class MixedFitted(Fitted):
     """`model`, fitted to `scene`."""
 
     def __init__(self, model: DynamicModel, scene: TrainingScene, history: History | None = None) -> None:
         self.model, self.scene, self.history = model.eval(), scene, history
         self._liquid: dict[int, NDArray[np.bool_]] = {}
+        self._masked = _Masked(scene, {name: self.lens(camera) for name, camera in scene.cameras.items()})
+
+    def model_time(self, seconds: float, camera: Camera | None = None) -> float:
+        """`seconds` of the scene's clock as the model takes times; `camera` that took the photograph, if one did."""
+        return unit_time(self.scene, seconds)
+
+    def lens(self, camera: Camera) -> Camera:
+        """`camera` as the model was fitted with it."""
+        return camera
 
     @torch.no_grad()
     def render(self, camera: Camera, time: float) -> Render:
-        unit = unit_time(self.scene, time)
+        unit, camera = self.model_time(time, camera), self.lens(camera)
         with one_torch_thread():
             splats = self.model.splats(self.model.at(unit), camera)
             image = self.model.view(splats, camera, unit).clamp(0, 1).numpy()
@@ -51,15 +68,15 @@ class MixedFitted(Fitted):
     def liquid(self, t: int) -> NDArray[np.bool_]:
         """bool [N]: the Gaussians that the silhouettes of timestep `t` allow to be liquid."""
         if t not in self._liquid:
-            self._liquid[t] = silhouette_consistent(self._instant(t)[0], self.scene, t)
+            self._liquid[t] = silhouette_consistent(self._instant(t)[0], self._masked, t)
         return self._liquid[t]
 
     @torch.no_grad()
     def _instant(self, t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Means [N, 3] at timestep `t`, and whether a Gaussian is drawn at all in some training view, [N]."""
         with one_torch_thread():
-            state = self.model.at(unit_time(self.scene, float(self.scene.times[t])))
-            views: list[Splats] = [self.model.splats(state, camera) for camera in self.scene.cameras.values()]
+            state = self.model.at(self.model_time(float(self.scene.times[t])))
+            views: list[Splats] = [self.model.splats(state, camera) for camera in self._masked.cameras.values()]
         strongest = np.stack([view.opacities.numpy() for view in views]).max(axis=0)
         return views[0].means.numpy(), strongest >= MIN_ALPHA
 

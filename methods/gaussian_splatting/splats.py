@@ -51,7 +51,12 @@ class DynamicModel(nn.Module, ABC):
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Rotations [N, 3, 3] of quaternions [N, 4] (w x y z), normalised here."""
-    w, x, y, z = nn.functional.normalize(quaternions, dim=1).unbind(1)
+    return unit_quaternion_matrices(nn.functional.normalize(quaternions, dim=1))
+
+
+def unit_quaternion_matrices(quaternions: Tensor) -> Tensor:
+    """Matrices [N, 3, 3] of quaternions [N, 4] (w x y z) that are taken to be unit ones; of others, no rotations."""
+    w, x, y, z = quaternions.unbind(1)
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

@@ -54,29 +54,36 @@ class Gaussians(NamedTuple):
     scales: torch.Tensor
 
 
-def _head(outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(FEATURES + 3, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
+def head(inputs: int, outputs: int) -> nn.Sequential:
+    """A network with one hidden layer, shared by all anchors."""
+    return nn.Sequential(nn.Linear(inputs, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
 
 
-class AnchorModel(nn.Module):
-    """N anchors with K children each; parameters in scene units."""
+class Anchors(nn.Module):
+    """The tables of N anchors with K children each, in space or in space-time (D dimensions)."""
 
     positions: torch.Tensor
 
-    def __init__(self, n: int, variant: Variant) -> None:
+    def __init__(self, n: int, children: int, dimensions: int) -> None:
         super().__init__()
-        self.variant = variant
-        children = variant.children
-        self.register_buffer("positions", torch.zeros(n, 3))
+        self.register_buffer("positions", torch.zeros(n, dimensions))
         self.features = nn.Parameter(torch.zeros(n, FEATURES))
-        self.offsets = nn.Parameter(torch.zeros(n, children, 3))
-        self.log_scales = nn.Parameter(torch.zeros(n, 6))
-        self.opacity_head = _head(children)
-        self.shape_head = _head(7 * children)
-        self.color_head = _head(3 * children)
+        self.offsets = nn.Parameter(torch.zeros(n, children, dimensions))
+        self.log_scales = nn.Parameter(torch.zeros(n, 2 * dimensions))
 
     def __len__(self) -> int:
         return len(self.positions)
+
+
+class AnchorModel(Anchors):
+    """N static anchors with K children each; parameters in scene units."""
+
+    def __init__(self, n: int, variant: Variant) -> None:
+        super().__init__(n, variant.children, 3)
+        self.variant = variant
+        self.opacity_head = head(FEATURES + 3, variant.children)
+        self.shape_head = head(FEATURES + 3, 7 * variant.children)
+        self.color_head = head(FEATURES + 3, 3 * variant.children)
 
     @classmethod
     def from_seed(cls, seed: AnchorSeed, variant: Variant) -> AnchorModel:
@@ -124,9 +131,9 @@ class AnchorModel(nn.Module):
         return Gaussians(means.view(rows, 3), factors, opacity, torch.sigmoid(logits).view(rows, 3), scales)
 
 
-def random_offsets(n: int, children: int) -> torch.Tensor:
-    """Offsets [n, children, 3] of new anchors, from torch's generator; within the anchor's cell."""
-    return torch.rand(n, children, 3) * 1.4 - 0.7
+def random_offsets(n: int, children: int, dimensions: int = 3) -> torch.Tensor:
+    """Offsets [n, children, dimensions] of new anchors, from torch's generator; within the anchor's cell."""
+    return torch.rand(n, children, dimensions) * 1.4 - 0.7
 
 
 def to_arrays(model: AnchorModel) -> dict[str, np.ndarray]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
-from splashbench_methods.scaffold_gs.model import PER_ANCHOR, AnchorModel
+from splashbench_methods.scaffold_gs.model import PER_ANCHOR, Anchors
 
 # "published" are those of Scaffold-GS.
-_RATES: dict[str, dict[str, Rate]] = {
+RATES: dict[str, dict[str, Rate]] = {
     "published": {
         "offsets": Rate(0.01, 0.0001),
         "features": Rate.constant(0.0075),
@@ -34,13 +35,15 @@ _RATES: dict[str, dict[str, Rate]] = {
 class AnchorOptimizer(RowOptimizer):
     """Updates `model`; the learning rates go from their first to their last value over `iterations` steps."""
 
-    model: AnchorModel
+    model: Anchors
 
-    def __init__(self, model: AnchorModel, rates: Literal["short", "published"], iterations: int) -> None:
-        super().__init__(model, _RATES[rates], PER_ANCHOR, iterations)
+    def __init__(
+        self, model: Anchors, rates: Literal["short", "published"] | Mapping[str, Rate], iterations: int
+    ) -> None:
+        super().__init__(model, RATES[rates] if isinstance(rates, str) else rates, PER_ANCHOR, iterations)
 
     def replace_anchors(self, kept: NDArray[np.int64], positions: torch.Tensor, new: dict[str, torch.Tensor]) -> None:
-        """Keep the anchors `kept` and append new ones, at `positions` [n, 3] and with rows of each of PER_ANCHOR.
+        """Keep the anchors `kept` and append new ones, at `positions` [n, D] and with rows of each of PER_ANCHOR.
 
         Kept rows keep their moments; new ones start without any.
         """

@@ -97,11 +97,12 @@ class SpacetimeModel(DynamicModel):
         return Splats(state.means, state.factors, state.opacities, state.channels)
 
     def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
-        if not self.full:
-            return rendered
+        return torch.sigmoid(self.decoded(rendered, camera)) if self.full else rendered
+
+    def decoded(self, rendered: Tensor, camera: Camera) -> Tensor:
+        """Logits [H, W, 3] of the full model's channels [H, W, 9]."""
         base, features, timed = rendered.split(3, dim=2)
-        decoded = self.decoder(torch.cat([features, timed, torch.from_numpy(rays(camera))], dim=2))
-        return torch.sigmoid(base + decoded)
+        return base + self.decoder(torch.cat([features, timed, torch.from_numpy(rays(camera))], dim=2))
 
 
 def rays(camera: Camera) -> np.ndarray:
