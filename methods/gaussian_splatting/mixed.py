@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from splashbench_methods.gaussian_splatting.fitting import History
 from splashbench_methods.gaussian_splatting.photographs import unit_time
-from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats
+from splashbench_methods.gaussian_splatting.splats import DynamicModel
 
 from splashbench.adapter.contract import Fitted, Render
 from splashbench.errors import SplashbenchError, one_line
@@ -60,6 +60,8 @@ class MixedFitted(Fitted):
             splats = self.model.splats(self.model.at(unit), camera)
             image = self.model.view(splats, camera, unit).clamp(0, 1).numpy()
         liquid = self.liquid(int(np.abs(self.scene.times - time).argmin()))
+        if splats.rows is not None:
+            liquid = liquid[splats.rows.numpy()]
         means, factors, opacities = (t.numpy()[liquid] for t in (splats.means, splats.factors, splats.opacities))
         with counters.uncounted():  # asked for by the protocol, no part of the method's image
             _, alpha = rasterize_arrays(means, factors, opacities, None, camera)
@@ -68,23 +70,33 @@ class MixedFitted(Fitted):
     def liquid(self, t: int) -> NDArray[np.bool_]:
         """bool [N]: the Gaussians that the silhouettes of timestep `t` allow to be liquid."""
         if t not in self._liquid:
-            self._liquid[t] = silhouette_consistent(self._instant(t)[0], self._masked, t)
+            self._liquid[t] = silhouette_consistent(self._means(t), self._masked, t)
         return self._liquid[t]
 
     @torch.no_grad()
-    def _instant(self, t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Means [N, 3] at timestep `t`, and whether a Gaussian is drawn at all in some training view, [N]."""
+    def _means(self, t: int) -> NDArray[np.float32]:
+        """Means [N, 3] of all Gaussians at timestep `t`."""
+        with one_torch_thread():
+            return np.asarray(self.model.means(self.model_time(float(self.scene.times[t]))).numpy())
+
+    @torch.no_grad()
+    def _drawn(self, t: int, count: int) -> NDArray[np.bool_]:
+        """bool [count]: which of all Gaussians are drawn at all in some training view at timestep `t`."""
+        drawn = np.zeros(count, bool)
         with one_torch_thread():
             state = self.model.at(self.model_time(float(self.scene.times[t])))
-            views: list[Splats] = [self.model.splats(state, camera) for camera in self._masked.cameras.values()]
-        strongest = np.stack([view.opacities.numpy() for view in views]).max(axis=0)
-        return views[0].means.numpy(), strongest >= MIN_ALPHA
+            for camera in self._masked.cameras.values():
+                splats = self.model.splats(state, camera)
+                drawn[slice(None) if splats.rows is None else splats.rows.numpy()] |= (
+                    splats.opacities.numpy() >= MIN_ALPHA
+                )
+        return drawn
 
     def particles(self) -> Particles | None:
-        instants = [self._instant(t) for t in range(self.scene.n_frames)]
-        active = np.stack([drawn & self.liquid(t) for t, (_, drawn) in enumerate(instants)])
+        steps = range(self.scene.n_frames)
+        active = np.stack([liquid & self._drawn(t, len(liquid)) for t, liquid in ((t, self.liquid(t)) for t in steps)])
         ever = active.any(axis=0)
-        return Particles(np.stack([means[ever] for means, _ in instants]), active[:, ever])
+        return Particles(np.stack([self._means(t)[ever] for t in steps]), active[:, ever])
 
     def save(self, directory: Path) -> None:
         arrays = {name: tensor.detach().numpy() for name, tensor in self.model.state_dict().items()}
@@ -109,8 +121,9 @@ def load_tables(model_file: Path, model: DynamicModel, rows: tuple[str, ...]) ->
     arrays = read_npz(model_file, shapes)
     count = len(arrays[rows[0]])
     for name in rows:
-        old = model.get_parameter(name)
-        setattr(model, name, torch.nn.Parameter(torch.zeros(count, *old.shape[1:])))
+        old = getattr(model, name)
+        blank = torch.zeros(count, *old.shape[1:])
+        setattr(model, name, torch.nn.Parameter(blank) if isinstance(old, torch.nn.Parameter) else blank)
     try:
         model.load_state_dict({name: torch.from_numpy(arrays[name]) for name in shapes})
     except RuntimeError as error:

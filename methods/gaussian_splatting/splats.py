@@ -18,7 +18,7 @@ class Splats:
     """N Gaussians as a camera is to see them: means [N, 3], factors [N, 3, 3] of the covariances B B^T, scene units.
 
     opacities: [N] in [0, 1]; colors: [N, C], of any meaning (`DynamicModel.image`). penalty: a scalar that a fit adds
-    to its loss, or None.
+    to its loss, or None. rows: int64 [N], which of the model's Gaussians these are; None for all of them in order.
     """
 
     means: Tensor
@@ -26,6 +26,7 @@ class Splats:
     opacities: Tensor
     colors: Tensor
     penalty: Tensor | None = None
+    rows: Tensor | None = None
 
 
 class DynamicModel(nn.Module, ABC):
@@ -35,9 +36,14 @@ class DynamicModel(nn.Module, ABC):
         """What all views of one instant share, such as a network's output; it is handed to `splats`."""
         return time
 
+    def means(self, time: float) -> Tensor:
+        """Where all Gaussians of the model are at `time`, seen or not: [N, 3], scene units."""
+        return torch.as_tensor(self.at(time).means)
+
     @abstractmethod
     def splats(self, state: Any, camera: Camera) -> Splats:
-        """The Gaussians at the instant of `state` (see `at`) as `camera` is to see them."""
+        """The Gaussians at the instant of `state` (see `at`) as `camera` is to see them; those it leaves out are none
+        that could be seen."""
 
     def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
         """Colours [H, W, 3] of what was rasterized [H, W, C]; as it is, unless a network decodes it."""

@@ -6,6 +6,7 @@ import json
 import shutil
 import struct
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,6 +19,8 @@ DEFORMABLE = ["x", "y", "z", "nx", "ny", "nz", *_HARMONICS, *_SHAPED]
 _TURNING = [f"omega_{i}" for i in range(4)]
 LITE = [*_MOVING, *(f"f_dc_{i}" for i in range(3)), *_SHAPED, *_TURNING]
 FULL = [*_MOVING, *(f"f_dc_{i}" for i in range(6)), *_SHAPED, *_TURNING, *(f"f_t_{i}" for i in range(3))]
+ANCHORS = ["x", "y", "z", "t", *(f"f_offset_{i}" for i in range(40)), *(f"f_anchor_feat_{i}" for i in range(32))]
+ANCHORS += ["opacity", *(f"scale_{i}" for i in range(8)), *(f"rot_{i}" for i in range(4))]
 
 
 def write_ply(path: Path, names: Sequence[str], rows: np.ndarray) -> None:
@@ -57,6 +60,42 @@ def write_spacetime(out: Path, rows: np.ndarray, decoder: Mapping[str, np.ndarra
     if decoder is not None:
         torch.save({name: torch.from_numpy(np.float32(a)) for name, a in decoder.items()}, path.with_suffix(".pt"))
     write_arguments(out, **{"duration": 8, "loader": "technicolor", "rgbfunction": "sandwich", **arguments})
+
+
+def write_scaffold(
+    out: Path, rows: np.ndarray, heads: Mapping[str, Mapping[str, np.ndarray]], traced: bool = True, **arguments: object
+) -> None:
+    """A model of 4D-Scaffold-GS: heads that torch traced, as the code saves them, or weights alone."""
+    import torch
+
+    folder = out / "point_cloud/iteration_120000"
+    write_ply(folder / "point_cloud.ply", ANCHORS, rows)
+    for name, weights in heads.items():
+        tensors = {key: torch.from_numpy(np.float32(array)) for key, array in weights.items()}
+        if not traced:
+            torch.save(tensors, folder / f"{name}.pt")
+            continue
+        last = {"opacity_mlp": torch.nn.Tanh(), "flow_mlp": torch.nn.Tanh(), "color_mlp": torch.nn.Sigmoid()}
+        (hidden, inputs), outputs = tensors["0.weight"].shape, len(tensors["2.bias"])
+        layers = [torch.nn.Linear(inputs, hidden), torch.nn.ReLU(True), torch.nn.Linear(hidden, outputs)]
+        network = torch.nn.Sequential(*layers, *([last[name]] if name in last else []))
+        network.load_state_dict(tensors)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            torch.jit.trace(network.eval(), torch.rand(1, inputs)).save(folder / f"{name}.pt")
+    given = {"appearance_dim": 0, "temporal_opacity": "ours", "use_flow": True, "hparam_beta": 4.0, "frame_ratio": 0.33}
+    write_arguments(out, **{**given, "time_duration": [0.0, 10.0], "white_background": False, **arguments})
+
+
+def scaffold_heads(rng: np.random.Generator, children: int = 10) -> dict[str, dict[str, np.ndarray]]:
+    """The four heads with numbers of our own."""
+    sizes = {"opacity_mlp": (32, 1), "cov_mlp": (32, 8), "color_mlp": (35, 3), "flow_mlp": (32, 3)}
+    heads = {}
+    for name, (inputs, outputs) in sizes.items():
+        first, second = rng.normal(0, 0.3, (32, inputs)), rng.normal(0, 0.3, (outputs * children, 32))
+        biases = rng.normal(0, 0.3, 32), rng.normal(0, 0.5, outputs * children)
+        heads[name] = {"0.weight": first, "0.bias": biases[0], "2.weight": second, "2.bias": biases[1]}
+    return {name: {key: np.float32(array) for key, array in weights.items()} for name, weights in heads.items()}
 
 
 def deform_network(rng: np.random.Generator, synthetic: bool = False, scale: float = 0.1) -> dict[str, np.ndarray]:

@@ -178,6 +178,62 @@ def spacetime_at(row: Mapping[str, float], t: float) -> Gaussian:
     return Gaussian(mean, covariance(scales, q / np.linalg.norm(q)), opacity, np.array(channels))
 
 
+def anchor_shows(row: Mapping[str, float], lens: Lens) -> bool:
+    """Whether the published kernel finds the anchor itself on any tile of 16 x 16 pixels."""
+    place, flat, depth = footprint(
+        np.array([row[name] for name in "xyz"]), np.diag(np.exp([2 * row[f"scale_{i}"] for i in range(3)])), lens
+    )
+    middle = (flat[0, 0] + flat[1, 1]) / 2
+    largest = middle + math.sqrt(max(0.1, middle**2 - np.linalg.det(flat)))
+    radius = math.ceil(3 * math.sqrt(largest))
+    count = 1
+    for at, size in zip(place, (lens.width, lens.height)):
+        tiles = (size + 15) // 16
+        first = min(tiles, max(0, int((at - radius) / 16)))
+        last = min(tiles, max(0, int((at + radius + 15) / 16)))
+        count *= last - first
+    return depth > 0.2 and count > 0
+
+
+def anchor_at(
+    row: Mapping[str, float],
+    heads: Mapping[str, Mapping[str, np.ndarray]],
+    t: float,
+    eye: np.ndarray,
+    ours: bool = True,
+    flows: bool = True,
+    beta: float = 4.0,
+) -> list[Gaussian]:
+    """The children that an anchor of 4D-Scaffold-GS has at time t, seen from `eye`."""
+
+    def head(name: str, inputs: np.ndarray) -> np.ndarray:
+        w = {key: array.astype(float) for key, array in heads[name].items()}
+        return w["2.weight"] @ np.maximum(w["0.weight"] @ inputs + w["0.bias"], 0) + w["2.bias"]
+
+    feature = np.array([row[f"f_anchor_feat_{i}"] for i in range(32)])
+    place = np.array([row[name] for name in "xyz"])
+    scale = np.exp([row[f"scale_{i}"] for i in range(8)])
+    view = (place - eye) / np.linalg.norm(place - eye)
+    rho, shape = np.tanh(head("opacity_mlp", feature)), head("cov_mlp", feature).reshape(-1, 8)
+    flow = np.tanh(head("flow_mlp", feature)).reshape(-1, 3)
+    color = sigmoid(head("color_mlp", np.concatenate([feature, view]))).reshape(-1, 3)
+    children = len(rho)
+    found = []
+    for k in range(children):
+        if rho[k] <= 0:
+            continue
+        offset = np.array([row[f"f_offset_{axis * children + k}"] for axis in range(4)])
+        when = row["t"] + offset[3] * scale[3]
+        mean = place + offset[:3] * scale[:3] + (flow[k] * (when - t) if flows else 0)
+        raw = shape[k, 3]
+        sigma = (raw if raw > 0 else math.exp(raw) - 1) + 1
+        fading = math.exp(-(abs((when - t) * sigma) ** beta)) if ours else math.exp(-((when - t) ** 2) * sigma)
+        q = shape[k, 4:] / np.linalg.norm(shape[k, 4:])
+        cov = covariance(scale[4:7] * sigmoid(shape[k, :3]), q)
+        found.append(Gaussian(mean, cov, float(rho[k] * fading), color[k]))
+    return found
+
+
 def sandwich(image: np.ndarray, lens: Lens, decoder: Mapping[str, np.ndarray], ends: bool) -> np.ndarray:
     """SpacetimeGaussians' decoder, pixel by pixel: [H, W, 9] to [H, W, 3]; `ends` in a sigmoid, or clamped."""
     first, second = (np.asarray(decoder[f"mlp{i}.weight"], float)[:, :, 0, 0] for i in (1, 2))

@@ -22,6 +22,7 @@ SETTINGS: dict[str, dict[str, object]] = {
         "width": 16,
         "depth": 4,
     },
+    "scaffold_4d": {**_SPARSE, "hull_points": 400, "most": 1500},
     "spacetime_gaussians": {**_SPARSE, "hull_points": 400, "most": 1500},
     "spacetime_gaussians_lite": {**_SPARSE, "hull_points": 400, "most": 1500},
 }

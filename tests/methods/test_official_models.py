@@ -23,6 +23,7 @@ from splashbench_methods.deformable_3dgs.official import OfficialDeformable3DGS
 from splashbench_methods.gaussian_splatting.checkpoint import read_weights
 from splashbench_methods.gaussian_splatting.official import Arguments, OfficialFitted
 from splashbench_methods.gaussian_splatting.point_cloud import read_point_cloud
+from splashbench_methods.scaffold_4d.official import OfficialScaffold4D, in_the_image
 from splashbench_methods.spacetime_gaussians.official import OfficialSpacetimeGaussians
 
 from splashbench.adapter.importers import Importer, load_importer, registered_importers
@@ -68,6 +69,13 @@ def nerfies(balls: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def late(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """A scene whose cameras each have a clock of their own."""
     return write_balls_scene(tmp_path_factory.mktemp("scenes") / "balls", delays={"2": 0.011, "6": 0.017, "7": -0.006})
+
+
+@pytest.fixture(scope="module")
+def blender(late: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("blender") / "balls"
+    export_scene(late, out, "blender", initial_points(late, POINTS), test_images="blank")
+    return out
 
 
 def rows_of(names: list[str], rng: np.random.Generator, n: int = 6, **columns: object) -> np.ndarray:
@@ -325,6 +333,101 @@ class TestSpacetime:
             OfficialSpacetimeGaussians().read(tmp_path, tmp_path, balls.training())
 
 
+class TestScaffold:
+    def rows(self, rng: np.random.Generator, n: int = 4) -> np.ndarray:
+        rows = rows_of(layouts.ANCHORS, rng, n, t=rng.uniform(0, 0.33, n))
+        for i, name in enumerate(layouts.ANCHORS):
+            if name.startswith(("f_offset", "f_anchor_feat")):
+                rows[:, i] = rng.normal(0, 1, n)
+        rows[:, layouts.ANCHORS.index("rot_0") :] = [1, 0, 0, 0]
+        return np.float32(rows).astype(float)
+
+    def expected(self, rows: np.ndarray, heads: dict, camera: Camera, t: float, **variant: object) -> np.ndarray:
+        lens = lens_of(camera)._replace(slopes=(np.tan(-0.5), np.tan(-0.5)))
+        eye = -lens.R.T @ lens.t
+        shown = [row for row in named(layouts.ANCHORS, rows) if reference.anchor_shows(row, lens)]
+        gaussians = [g for row in shown for g in reference.anchor_at(row, heads, t, eye, **variant)]
+        return np.clip(reference.draw(gaussians, lens), 0, 1)
+
+    def model(
+        self, out: Path, export: Path, scene: Scene, rows: np.ndarray, heads: dict, traced: bool = True, **words: object
+    ) -> OfficialFitted:
+        layouts.write_scaffold(out, rows, heads, traced, **words)
+        return OfficialScaffold4D().read(out, export, scene.training())
+
+    @pytest.mark.parametrize(
+        ("words", "variant"),
+        [
+            ({}, {}),
+            ({"temporal_opacity": "4dgs", "use_flow": False}, {"ours": False, "flows": False}),
+            ({"hparam_beta": 2.0, "frame_ratio": 1.0}, {"beta": 2.0}),
+        ],
+    )
+    def test_it_is_the_published_formula(
+        self, late: Scene, blender: Path, tmp_path: Path, words: dict, variant: dict
+    ) -> None:
+        rng = np.random.default_rng(1)
+        rows, heads = self.rows(rng), layouts.scaffold_heads(rng)
+        assert rows.shape[1] == 89
+        fitted = self.model(tmp_path, blender, late, rows, heads, traced=not words, **words)
+        camera, facts = late.cameras["7"], read_json(blender / "splashbench.json")
+        seconds = float(late.camera_times["7"][4])
+        t = (seconds - facts["time_origin_seconds"]) / facts["time_span_seconds"] * words.get("frame_ratio", 0.33)
+        wanted = self.expected(rows, heads, camera, t, **variant)
+        assert_same_image(fitted.render(camera, seconds).rgb, wanted)
+
+    def test_anchors_that_do_not_show_give_nothing(self, late: Scene, blender: Path, tmp_path: Path) -> None:
+        rng = np.random.default_rng(2)
+        rows, heads = self.rows(rng, 24), layouts.scaffold_heads(rng)
+        camera = late.cameras["6"]
+        # All about the frame, a good deal of them just outside.
+        pixels = rng.uniform([-30, -30], [126, 94], (24, 2))
+        rays = np.concatenate([(pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], np.ones((24, 1))], axis=1)
+        rows[:, :3] = np.float32(camera.center + 1.5 * rays @ camera.w2c[:3, :3])
+        for i in range(3):
+            rows[:, layouts.ANCHORS.index(f"scale_{i}")] = np.float32(-4.0)
+        lens = lens_of(camera)._replace(slopes=(np.tan(-0.5), np.tan(-0.5)))
+        shown = [reference.anchor_shows(row, lens) for row in named(layouts.ANCHORS, rows)]
+        assert 5 < sum(shown) < 20
+        fitted = self.model(tmp_path, blender, late, rows, heads, traced=False)
+        found = in_the_image(
+            fitted.model.positions[:, :3], fitted.model.log_scales.detach()[:, :3], camera, fitted.model.near
+        )
+        assert found.tolist() == shown
+        seconds = float(late.camera_times["6"][3])
+        t = fitted.model_time(seconds)
+        assert_same_image(fitted.render(camera, seconds).rgb, self.expected(rows, heads, camera, t))
+
+    def test_a_loaded_model_renders_the_same(self, late: Scene, blender: Path, tmp_path: Path) -> None:
+        rng = np.random.default_rng(3)
+        words = {"temporal_opacity": "4dgs", "white_background": True}
+        fitted = self.model(
+            tmp_path / "out", blender, late, self.rows(rng, 12), layouts.scaffold_heads(rng), False, **words
+        )
+        assert_same_when_loaded(OfficialScaffold4D(), fitted, late, tmp_path / "model")
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            ({"appearance_dim": 32}, "cfg_args: colours depend on .*; train with --appearance_dim 0"),
+            ({"use_feat_bank": True}, "cfg_args: models with --use_feat_bank are not read; train without it"),
+        ],
+    )
+    def test_other_models_are_refused_by_name(
+        self, late: Scene, blender: Path, tmp_path: Path, words: dict, message: str
+    ) -> None:
+        rng = np.random.default_rng(4)
+        with pytest.raises(SplashbenchError, match=message):
+            self.model(tmp_path, blender, late, self.rows(rng), layouts.scaffold_heads(rng), False, **words)
+
+    def test_other_sizes_are_named(self, late: Scene, blender: Path, tmp_path: Path) -> None:
+        rng = np.random.default_rng(5)
+        with pytest.raises(SplashbenchError, match=r"cov_mlp\.pt: 2\.weight is float32 \[40, 32\], not .* \[80, 32\]"):
+            self.model(tmp_path, blender, late, self.rows(rng), layouts.scaffold_heads(rng, 5) | {
+                "opacity_mlp": layouts.scaffold_heads(rng)["opacity_mlp"]
+            })  # fmt: skip
+
+
 def assert_same_when_loaded(importer: Importer, fitted: OfficialFitted, scene: Scene, directory: Path) -> None:
     directory.mkdir()
     fitted.save(directory)
@@ -575,7 +678,7 @@ class TestTracedModules:
 
 
 def test_importers_are_there_and_say_what_they_read() -> None:
-    for name in ("deformable_3dgs", "spacetime_gaussians"):
+    for name in ("deformable_3dgs", "scaffold_4d", "spacetime_gaussians"):
         importer = load_importer(name)
         assert importer.id == name
         assert importer.formats

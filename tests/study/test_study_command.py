@@ -281,7 +281,9 @@ def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -
     assert "nearest_camera" in (out / "table.md").read_text()
 
 
-@pytest.mark.parametrize("name", ["ablation", "masks", "views", "sensitivity", "best", "lifetimes", "baselines", "interpolation"])
+@pytest.mark.parametrize(
+    "name", ["ablation", "masks", "views", "sensitivity", "best", "lifetimes", "baselines", "interpolation"]
+)
 def test_the_shipped_studies_fit_the_method(name: str, balls_directory: Path) -> None:
     assert name in shipped()
     plan = make_plan(load_spec(name, scenes=[str(balls_directory)]))

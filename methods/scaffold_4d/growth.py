@@ -1,0 +1,68 @@
+"""Anchors grow in cells of space-time where the loss pulls, whether what is there shows for long or for a moment.
+
+A Gaussian that shows for a moment is seen in few steps, and where it is faint its gradient is small. So the mean of its
+screen gradient is taken with the weights w = fading sigma (Cho et al. 2024, "dynamic-aware anchor growing"): w adds up
+to the same for a short and a long life, and the children count that have enough of it. A cell is one frame long; its
+size in space and the thresholds are those of static anchors (scaffold_gs/growth.py), but the finer a level, the more
+of its candidates are kept.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from splashbench_methods.gaussian_splatting.screen import screen_gradients
+from splashbench_methods.gaussian_splatting.splats import Splats
+from splashbench_methods.scaffold_4d.model import AnchorSplats
+from splashbench_methods.scaffold_4d.settings import Settings
+from splashbench_methods.scaffold_gs.cells import Level
+from splashbench_methods.scaffold_gs.growth import AnchorGrowth, GrowthRules
+from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
+from torch import Tensor
+
+from splashbench.scene import Camera
+
+LEVELS = (Level(16.0, 1.0, 0.5), Level(4.0, 2.0, 0.75), Level(1.0, 4.0, 0.875))
+
+
+class SpacetimeGrowth(AnchorGrowth):
+    """The rounds of growth and pruning in a fit. voxel: scene units, the finest; frame: a frame's share of the
+    recording."""
+
+    def __init__(
+        self, optimizer: AnchorOptimizer, voxel: float, frame: float, settings: Settings, rng: np.random.Generator
+    ) -> None:
+        views = settings.grow_every * settings.views_per_step
+        rules = GrowthRules(views, settings.grow_gradient, settings.prune_opacity, settings.most)
+        super().__init__(optimizer, np.array([voxel, voxel, voxel, frame]), LEVELS, rules, rng, np.float32)
+        self._from, self._until, self._every = (
+            round(settings.grow_from * settings.iterations),
+            round(settings.grow_until * settings.iterations),
+            settings.grow_every,
+        )
+
+    def wants_gradients(self, step: int) -> bool:
+        return self._from <= step < self._until
+
+    def observe(self, camera: Camera, splats: Splats, gradients: Tensor) -> None:
+        assert isinstance(splats, AnchorSplats)
+        assert splats.state is not None
+        state, pulls = splats.state, gradients.numpy()
+        anchors = state.anchors.numpy()
+        norms = screen_gradients(camera, splats.means.detach().numpy(), pulls)
+        weights = (state.fading * state.sigma).detach().numpy() * pulls.any(axis=1)
+        shape = (len(anchors), self._gradient.shape[1])
+        self._gradient[anchors] += (weights * norms).reshape(shape)
+        self._child_visits[anchors] += weights.reshape(shape)
+        self._see_anchors(camera, state.peaks.clamp(min=0).sum(dim=1).numpy())
+
+    def after_step(self, step: int) -> None:
+        if self._from <= step < self._until and (step + 1 - self._from) % self._every == 0:
+            self.round()
+
+    def _log_scales(self, parents: Tensor, sizes: NDArray[np.float64]) -> Tensor:
+        space = torch.from_numpy(np.log(sizes).astype(np.float32))[:, None].expand(-1, 3)
+        time = torch.full((len(sizes), 1), float(np.log(self.finest[3])))
+        # Features come from the parent, and with them sigma times the duration: so does the duration.
+        return torch.cat([space, time, space, self.anchors.log_scales.detach()[parents, 7:]], dim=1)
