@@ -7,6 +7,7 @@ renders them. Timesteps may be withheld, too, to see how a method interpolates: 
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,8 +29,11 @@ def make_training_view(scene: Scene, directory: Path, kept: Sequence[int] | None
     meta = _shown_meta(scene, kept)
     if scene.layout == ReleasedSource.layout:
         for name in RELEASED_FILES:
-            split = read_json(scene.directory / name)
-            write_json(directory / name, split | {key: [split[key][t] for t in kept] for key in ("k", "w2c", "fn")})
+            if len(kept) == scene.n_frames:
+                shutil.copyfile(scene.directory / name, directory / name)
+            else:
+                split = read_json(scene.directory / name)
+                write_json(directory / name, split | {key: [split[key][t] for t in kept] for key in ("k", "w2c", "fn")})
         for camera in scene.train:
             for t in kept:
                 for path in (scene.image_path(camera, t), scene.mask_path(camera, t)):

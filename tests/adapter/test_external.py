@@ -205,7 +205,12 @@ def test_a_run_that_is_stopped_ends_everything_and_leaves_nothing(
     arguments += ["--command", _fit("hang", tmp_path / "ids")]
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, env={**os.environ, "TMPDIR": str(scratch)})
+    process = subprocess.Popen(
+        arguments,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "TMPDIR": str(scratch)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
+    )
     ids = _wait_for(tmp_path / "ids")
     process.send_signal(number)
     assert process.wait(60) == status
