@@ -44,6 +44,7 @@ class FakeSubmission:
             scene_digest=self.scene_digest or self.scene.digest,
             control=self.control,
             mixed=self.mixed,
+            withheld=None,
             claimed={},
             hardware={"cpu": "test processor", "cores": 2},
         )
