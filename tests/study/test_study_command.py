@@ -260,7 +260,7 @@ def test_a_folder_with_other_files_is_left_alone(balls_directory: Path, tmp_path
 
 
 def test_an_unknown_study_is_told_with_those_there_are() -> None:
-    with pytest.raises(SplashbenchError, match=r"did you mean 'ablation'\?; give one of ablation, best, masks"):
+    with pytest.raises(SplashbenchError, match=r"did you mean 'ablation'\?; give one of ablation, baselines, best"):
         load_spec("ablations")
 
 
