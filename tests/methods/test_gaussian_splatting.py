@@ -88,6 +88,9 @@ class Table(DynamicModel):
         self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(n, 1))
         self.opacity_logits = nn.Parameter(torch.full((n,), float(np.log(opacity / (1 - opacity)))))
 
+    def means(self, time: float) -> torch.Tensor:
+        return self.positions
+
     def splats(self, state: object, camera: Camera) -> Splats:
         colors = torch.full((len(self.positions), 3), 0.5)
         factors = ellipsoids(self.log_scales, self.quaternions)
