@@ -10,8 +10,8 @@ With anchor (a, t), scales s = exp(log-scales) [8], offsets o [K, 4], feature f 
     color = sigmoid(MLP([f, d]))
 
 Published is s[7] = 1 and v_max = 1 in the scene's units per second; here the eighth scale, which the published code
-leaves unused, is how long an anchor's Gaussians show. With `own_base` the first three feature channels are added to the
-colour's logits, as in static anchors.
+leaves unused, is how long an anchor's Gaussians show. With `base_color` the first three feature channels are added to
+the colour's logits, as in static anchors.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ class Variant:
 class State:
     """The n anchors that show at an instant, by number, and their children, M = n K.
 
-    anchors: [n]. means [M, 3], factors [M, 3, 3], opacities [M]; fading [M] is alpha / rho, sigma [M] per recording.
-    peaks: [N, K], rho of all anchors without gradient. penalty: for the fit.
+    anchors: [n]; features: [n, F], theirs. means [M, 3], factors [M, 3, 3], opacities [M]; fading [M] is alpha / rho,
+    sigma [M] per recording. peaks: [N, K], rho of all anchors without gradient. penalty: for the fit.
     """
 
     anchors: Tensor
+    features: Tensor
     means: Tensor
     factors: Tensor
     opacities: Tensor
@@ -127,64 +128,72 @@ class SpacetimeAnchors(Anchors, DynamicModel):
             shape[:, 4] = 1.0
         return model
 
-    def _times(self, anchors: Tensor) -> tuple[Tensor, Tensor]:
-        """When the children of `anchors` show [n, K], and the anchors' scales [n, 8]."""
-        scales = torch.exp(self.log_scales[anchors])
-        return self.positions[anchors, 3:] + self.offsets[anchors, :, 3] * scales[:, 3:4], scales
-
     def _fading(self, raw: Tensor, scales: Tensor, since: Tensor) -> tuple[Tensor, Tensor]:
         """Fading and sigma [n, K] of the shape head's raw values [n, K]."""
         sigma = (nn.functional.elu(raw) + 1) / scales[:, 7:8]
-        return torch.exp(-((since * sigma).abs() ** self.beta)), sigma
+        return torch.exp(-((since * sigma).abs() ** float(self.beta))), sigma
 
     @torch.no_grad()
     def _shown(self, time: float) -> tuple[Tensor, Tensor]:
         """Anchors [n] with a child that is drawn at `time`, and rho [N, K] of all."""
-        every = torch.arange(len(self))
         peaks = torch.tanh(self.opacity_head(self.features))
-        last = self.shape_head[2]
-        hidden = self.shape_head[1](self.shape_head[0](self.features))
+        hidden, last = self.shape_head[:2](self.features), self.shape_head[2]
         raw = nn.functional.linear(hidden, last.weight[3::_SHAPE], last.bias[3::_SHAPE])
-        own, scales = self._times(every)
-        fading, _ = self._fading(raw, scales, own - time)
+        scales = torch.exp(self.log_scales)
+        fading, _ = self._fading(raw, scales, _since(self.positions, self.offsets, scales, time))
         # With a margin: what is left out here is fainter than what the renderer leaves out.
         return torch.nonzero((peaks * fading >= 0.9 * MIN_ALPHA).any(dim=1))[:, 0], peaks
 
     def at(self, time: float) -> State:
         anchors, peaks = self._shown(time)
         n, k = len(anchors), self.offsets.shape[1]
-        features = self.features[anchors]
-        own, scales = self._times(anchors)
-        since = own - time
+        # Picked once for all views: the gradient of a pick is a table of all anchors.
+        positions, features, offsets, log_scales = (
+            table.index_select(0, anchors) for table in (self.positions, self.features, self.offsets, self.log_scales)
+        )
+        scales = torch.exp(log_scales)
+        since = _since(positions, offsets, scales, time)
         shape = self.shape_head(features).view(n, k, _SHAPE)
         fading, sigma = self._fading(shape[..., 3], scales, since)
         opacities = (torch.tanh(self.opacity_head(features)) * fading).view(-1)
         axes = (scales[:, None, 4:7] * torch.sigmoid(shape[..., :3])).view(-1, 3)
-        factors = rotation_matrices(shape[..., 4:].reshape(-1, 4)) * axes[:, None]
         drawn = opacities.detach() >= MIN_ALPHA
         volumes = (axes / self.unit).prod(dim=1) * drawn
-        penalty = _VOLUME_WEIGHT * volumes.sum() / drawn.sum().clamp(min=1)
-        means = self._means(anchors, features, scales, since)
-        return State(anchors, means.view(-1, 3), factors, opacities, fading.view(-1), sigma.view(-1), peaks, penalty)
+        return State(
+            anchors=anchors,
+            features=features,
+            means=self._moved(positions, features, offsets, scales, since),
+            factors=rotation_matrices(shape[..., 4:].reshape(-1, 4)) * axes[:, None],
+            opacities=opacities,
+            fading=fading.view(-1),
+            sigma=sigma.view(-1),
+            peaks=peaks,
+            penalty=_VOLUME_WEIGHT * volumes.sum() / drawn.sum().clamp(min=1),
+        )
 
-    def _means(self, anchors: Tensor, features: Tensor, scales: Tensor, since: Tensor) -> Tensor:
-        flow = self.fastest * torch.tanh(self.flow_head(features)).view(len(anchors), -1, 3)
-        still = self.positions[anchors, None, :3] + self.offsets[anchors][..., :3] * scales[:, None, :3]
-        return still + flow * since[..., None]
+    def _moved(self, positions: Tensor, features: Tensor, offsets: Tensor, scales: Tensor, since: Tensor) -> Tensor:
+        """Means [n K, 3] of the children of anchors, given rows of the tables and `_since` of them."""
+        flow = self.fastest * torch.tanh(self.flow_head(features)).view(*since.shape, 3)
+        still = positions[:, None, :3] + offsets[..., :3] * scales[:, None, :3]
+        return (still + flow * since[..., None]).view(-1, 3)
 
     def means(self, time: float) -> Tensor:
-        every = torch.arange(len(self))
-        own, scales = self._times(every)
-        return self._means(every, self.features, scales, own - time).view(-1, 3)
+        scales = torch.exp(self.log_scales)
+        since = _since(self.positions, self.offsets, scales, time)
+        return self._moved(self.positions, self.features, self.offsets, scales, since)
 
     def splats(self, state: State, camera: Camera) -> AnchorSplats:
         n, k = len(state.anchors), self.offsets.shape[1]
         eye = torch.as_tensor(camera.center, dtype=torch.float32)
-        features = self.features[state.anchors]
         directions = nn.functional.normalize(self.positions[state.anchors, :3] - eye, dim=1)
-        logits = self.color_head(torch.cat([features, directions], dim=1)).view(n, k, 3)
+        logits = self.color_head(torch.cat([state.features, directions], dim=1)).view(n, k, 3)
         if self.base_color:
-            logits = logits + features[:, None, :3]
+            logits = logits + state.features[:, None, :3]
         colors = torch.sigmoid(logits).view(-1, 3)
         rows = (state.anchors[:, None] * k + torch.arange(k)).view(-1)
         return AnchorSplats(state.means, state.factors, state.opacities, colors, state.penalty, rows, state)
+
+
+def _since(positions: Tensor, offsets: Tensor, scales: Tensor, time: float) -> Tensor:
+    """t_k - tau [n, K]: how long after `time` a child shows most; rows of the tables, scales [n, 8]."""
+    return positions[:, 3:] + offsets[..., 3] * scales[:, 3:4] - time

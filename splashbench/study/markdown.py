@@ -128,7 +128,7 @@ def _variants(table: Table) -> str:
     for row in table.rows:
         first = row.runs[0].planned
         variant = first.variant
-        settings = first.overrides if row.control else variant.settings
+        settings = variant.settings if row.name in table.plan.spec.names else first.overrides
         method = f"{first.method} " if variant.method else ""
         changed = [f"{step.kind} {_amount(step.model_dump())}" for step in variant.perturbation]
         if variant.train_views is not None:

@@ -120,7 +120,7 @@ class StudySpec(_Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> StudySpec:
-        names = [variant.name for variant in self.variants]
+        names = self.names
         for what, values in (("variant", names), ("seed", self.seeds), ("metric", self.metrics)):
             twice = next((value for value in values if list(values).count(value) > 1), None)
             if twice is not None:
@@ -131,12 +131,17 @@ class StudySpec(_Model):
             raise ValueError(f"a variant may not be called {self.reference.method!r}: so is the reference's row")
         return self
 
+    @property
+    def names(self) -> list[str]:
+        """Of the variants, in order."""
+        return [variant.name for variant in self.variants]
+
     def variant(self, name: str) -> Variant:
         """The variant called `name`. Raises SplashbenchError where there is none."""
         for variant in self.variants:
             if variant.name == name:
                 return variant
-        names = [variant.name for variant in self.variants]
+        names = self.names
         raise SplashbenchError(f"study {self.name} has no variant {name!r}{_near(name, names)}; it has {_list(names)}")
 
 

@@ -1,30 +1,14 @@
 """Every method of this project keeps the contract, by the test that strangers are given."""
 
+from pathlib import Path
+
 import pytest
 
+from splashbench import toml
 from splashbench.adapter.discovery import registered
 from splashbench.conformance import Report, conform
 
-_SPARSE = {"iterations": 20, "static_points": 300}
-#: Small enough for a test; on top of preset quick.
-SETTINGS: dict[str, dict[str, object]] = {
-    "hull_points": {},
-    "nearest_camera": {},
-    "nothing": {"iterations": 20, "anchors": 300},
-    "scaffold_gs": {"iterations": 20, "anchors": 300},
-    "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
-    "deformable_3dgs": {
-        "iterations": 20,
-        "static_points": 300,
-        "hull_points": 200,
-        "most": 700,
-        "width": 16,
-        "depth": 4,
-    },
-    "scaffold_4d": {**_SPARSE, "hull_points": 400, "most": 1500},
-    "spacetime_gaussians": {**_SPARSE, "hull_points": 400, "most": 1500},
-    "spacetime_gaussians_lite": {**_SPARSE, "hull_points": 400, "most": 1500},
-}
+SETTINGS = toml.load(Path(__file__).with_name("small_fits.toml"))
 
 
 def faults(report: Report) -> dict[str, str]:

@@ -273,12 +273,16 @@ def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -
     )
     out = tmp_path / "out"
     assert main(["study", "ablate", _write(tmp_path, spec), str(out)]) == 0
-    rows = {row["variant"]: row["figures"] for row in _table(out)["rows"]}
-    assert rows["photograph"]["psnr"]["mean"] != rows["full"]["psnr"]["mean"]
+    rows = {row["variant"]: row for row in _table(out)["rows"]}
+    assert rows["photograph"]["figures"]["psnr"]["mean"] != rows["full"]["figures"]["psnr"]["mean"]
     results = {source.result.method: source.result for source in load_results(out / "results")}
     assert results["nearest_camera"].settings == {}  # the budget is of the study's own method
     assert results["grey"].settings["wobble"] == 0.1
-    assert "nearest_camera" in (out / "table.md").read_text()
+    # A control is set apart as one, whichever row it is.
+    assert {name: row["control"] for name, row in rows.items()} == {"full": False, "photograph": True}
+    table = (out / "table.md").read_text()
+    assert "| *photograph* | nearest_camera best | – |" in table
+    assert "**" not in table.split("| Variant |")[1]  # no best row, with one that is no control
 
 
 @pytest.mark.parametrize(

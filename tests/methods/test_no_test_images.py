@@ -5,26 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from splashbench import toml
 from splashbench.adapter.runner import run_method
 from splashbench.scene import Scene
 from splashbench.submission import Status, Submission
 
+SETTINGS = toml.load(Path(__file__).with_name("small_fits.toml"))
 PEEKING = Path(__file__).parents[1] / "conformance" / "methods_for_conformance.py"
-_SPARSE = {"iterations": 20, "static_points": 300}
-SMALL: dict[str, dict[str, object]] = {
-    "nothing": {"iterations": 20, "anchors": 300},
-    "scaffold_gs": {"iterations": 20, "anchors": 300},
-    "splashsplat": {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 20},
-    "deformable_3dgs": {
-        "iterations": 20,
-        "static_points": 300,
-        "hull_points": 200,
-        "most": 700,
-        "width": 16,
-        "depth": 4,
-    },
-    "spacetime_gaussians": {**_SPARSE, "hull_points": 400, "most": 1500},
-}
+_FAST = ("hull_points", "nearest_camera", "nothing")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +28,7 @@ def unreadable(balls_directory: Path, balls: Scene, tmp_path_factory: pytest.Tem
 
 def _handed_in(name: str, scene: Path, out: Path) -> tuple[Submission, dict[str, bytes]]:
     """The submission, and what the method made of the scene: renders, opacity, particles, geometry and model."""
-    submission = run_method(name, scene, out, preset=_quick(name), overrides=SMALL.get(name), timing_frames=0)
+    submission = run_method(name, scene, out, preset=_quick(name), overrides=SETTINGS.get(name), timing_frames=0)
     ours = ("submission.toml", "record.json", "SHA256SUMS")
     files = sorted(path for path in out.rglob("*") if path.is_file())
     return submission, {path.relative_to(out).as_posix(): path.read_bytes() for path in files if path.name not in ours}
@@ -51,16 +39,7 @@ def _quick(name: str) -> str | None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "hull_points",
-        "nearest_camera",
-        "nothing",
-        pytest.param("scaffold_gs", marks=pytest.mark.slow),
-        pytest.param("splashsplat", marks=pytest.mark.slow),
-        pytest.param("deformable_3dgs", marks=pytest.mark.slow),
-        pytest.param("spacetime_gaussians", marks=pytest.mark.slow),
-    ],
+    "name", [pytest.param(name, marks=[] if name in _FAST else pytest.mark.slow) for name in SETTINGS]
 )
 def test_a_run_is_the_same_without_test_views(
     name: str, balls_directory: Path, unreadable: Path, balls: Scene, tmp_path: Path
