@@ -37,10 +37,10 @@ from typing import Any
 
 import numpy as np
 from splashbench_methods.splashsplat.config import SplashSplatConfig
-from splashbench_methods.splashsplat.flip import FlipSettings, FlipSolver, gravity_in_voxels, velocities_at
+from splashbench_methods.splashsplat.flip import FlipSettings, FlipSolver, gravity_in_voxels
+from splashbench_methods.splashsplat.motion import Step
 from splashbench_methods.splashsplat.reconstruct import Observations
 from splashbench_methods.splashsplat.resample import newborns
-from splashbench_methods.splashsplat.transport import forecast
 
 from splashbench.adapter import hardware
 from splashbench.adapter.contract import Run
@@ -102,13 +102,13 @@ class Surroundings:
 class State:
     """What a predictor may know of step t -> t+1.
 
-    phi: phi_t on the hull grid, in transport voxels. control: u_t's control values, voxels per frame. carriers:
-    float32 [N, 3], transport-grid coordinates. dt: seconds.
+    phi: phi_t on the hull grid, in transport voxels. motion: the fitted one. carriers: float32 [N, 3], transport-grid
+    coordinates. dt: seconds.
     """
 
     t: int
     phi: np.ndarray
-    control: np.ndarray
+    motion: Step
     carriers: np.ndarray
     dt: float
     surroundings: Surroundings
@@ -121,7 +121,7 @@ def ours(state: State) -> np.ndarray:
     """Along the fitted velocity; a fall ends on the pool or at a wall where the preset knows of them."""
     identity = np.broadcast_to(np.eye(3, dtype=np.float32), (len(state.carriers), 3, 3))
     around = state.surroundings
-    moved = forecast(state.control, around.config.control_factor, state.carriers, identity)[0]
+    moved = state.motion.forecast(state.carriers, identity)[0]
     return around.observations.landed(state.t + 1, state.carriers, moved) if around.config.ballistic else moved
 
 
@@ -136,7 +136,7 @@ def flip(settings: FlipSettings, state: State) -> np.ndarray:
     solver, rng = around.solver(settings), np.random.default_rng([0, state.t])
     liquid = solver.fill(state.phi, around.ratio, rng)
     particles = np.concatenate([state.carriers, liquid])
-    velocities = velocities_at(state.control, around.config.control_factor, particles) / state.dt
+    velocities = state.motion.velocity(particles) / state.dt
     return solver.step(particles, velocities, state.dt)[0][: len(state.carriers)].astype(np.float32)
 
 
@@ -166,7 +166,7 @@ def steps(
             carriers = newborns(before, around.grid, around.ratio, nothing, around.config.carriers.shell, rng)
             dt = float(around.scene.times[t] - around.scene.times[t - 1])
             if len(carriers):
-                yield State(t - 1, before, observations.velocities[t - 1], carriers, dt, around), phi
+                yield State(t - 1, before, observations.motion.step(t - 1), carriers, dt, around), phi
         before = phi
 
 

@@ -30,6 +30,8 @@ _ASTRAY, _UNEVEN = 0.5, 0.3
 _BODY = 4.0
 # A jet is taken as steady over so many frames.
 _STEADY = 3
+# Above its top a jet is no slower than this share of its speed there.
+_SLOWEST = 0.2
 # Speeds tried, up to so many times that of a fall through all that is seen.
 _SPEEDS, _FASTEST = 80, 4.0
 
@@ -111,13 +113,21 @@ class Jet:
 
     def fall_time(self, height: np.ndarray) -> np.ndarray:
         """Seconds from `top` down to `height` (negative above it, as far as the jet can have risen)."""
-        square = np.maximum(self.speed**2 + 2 * self.gravity * (self.top - np.asarray(height)), (0.2 * self.speed) ** 2)
-        return (np.sqrt(square) - self.speed) / self.gravity
+        return (np.sqrt(np.maximum(self._square(height), (_SLOWEST * self.speed) ** 2)) - self.speed) / self.gravity
 
     def velocity(self, height: np.ndarray) -> np.ndarray:
         """[..., 3] upright velocity of its liquid at `height` [...]."""
         down = self.speed + self.gravity * self.fall_time(height)
         return np.stack([np.full_like(down, self.drift[0]), np.full_like(down, self.drift[1]), -down], axis=-1)
+
+    def growth(self, height: np.ndarray) -> np.ndarray:
+        """[...] how fast the downward speed grows with the depth at `height` [...], 1 / s."""
+        down = self.speed + self.gravity * self.fall_time(height)
+        return np.where(self._square(height) > (_SLOWEST * self.speed) ** 2, self.gravity / down, 0.0)
+
+    def _square(self, height: np.ndarray) -> np.ndarray:
+        """Of the downward speed at `height` [...]; negative where the jet does not rise so high."""
+        return np.asarray(self.speed**2 + 2 * self.gravity * (self.top - np.asarray(height)))
 
     def axis(self, height: np.ndarray) -> np.ndarray:
         """[..., 2] middle of the jet at `height` [...]."""

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
+from splashbench_methods.splashsplat.motion import Motion
 from splashbench_methods.splashsplat.resample import ShellSettings, cell_of, newborns, within_capacity
-from splashbench_methods.splashsplat.transport import correct, forecast
+from splashbench_methods.splashsplat.transport import correct
 
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
@@ -106,8 +107,7 @@ def track_carriers(
     fields: Iterable[np.ndarray],
     hull_grid: Grid,
     grid: Grid,
-    velocities: np.ndarray,
-    factor: int,
+    motion: Motion,
     settings: CarrierSettings,
     seed: int,
     seen: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
@@ -116,8 +116,8 @@ def track_carriers(
 ) -> Carriers:
     """Run the loop over all frames.
 
-    fields: phi_t on `hull_grid`, one frame after another, in transport voxels. grid: the transport grid. velocities:
-    float32 [T - 1, cx, cy, cz, 3] control values, `factor` transport voxels apart. seen: given phi_t and hull-grid
+    fields: phi_t on `hull_grid`, one frame after another, in transport voxels. grid: the transport grid. motion: its
+    step t - 1 is asked for once phi_t has come. seen: given phi_t and hull-grid
     coordinates [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. landed: given
     t, where carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3].
     simulation: makes one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
@@ -139,7 +139,7 @@ def track_carriers(
             ids, x, F = ids[inside], x[inside], F[inside]
         elif t > 0 and len(ids):
             start = x
-            x, F = forecast(velocities[t - 1], factor, x, F)
+            x, F = motion.step(t - 1).forecast(x, F)
             if landed is not None:
                 x = landed(t, start, x)
             x = correct(phi, x, float(ratio), settings.correction)

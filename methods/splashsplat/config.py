@@ -43,7 +43,7 @@ class SplashSplatConfig(MethodConfig):
     # Velocity
     #: free fall for the jet (needs gravity, the metric scale and the frames' times)
     ballistic: bool = True
-    #: no motion where the level set's does not lead nearer to the next observation
+    #: no motion where the level set's leads farther away from the observations than none
     gate_motion: bool = True
     velocity_steps: int = Field(35, ge=0)
     velocity_step_size: PositiveFloat = 0.45

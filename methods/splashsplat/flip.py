@@ -21,8 +21,8 @@ from splashbench_methods.splashsplat.flip_grid import (
     to_particles,
 )
 from splashbench_methods.splashsplat.flip_pressure import apply_pressure, assemble, divergence, number_cells, solve
+from splashbench_methods.splashsplat.motion import Step
 from splashbench_methods.splashsplat.transport import clamp_stretch
-from splashbench_methods.splashsplat.velocity import velocities_at
 
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Grid
@@ -245,15 +245,15 @@ class FlipTransport:
         self._velocities: np.ndarray | None = None
 
     def forecast(
-        self, ids: np.ndarray, deformation: np.ndarray, dt: float, control: np.ndarray, factor: int
+        self, ids: np.ndarray, deformation: np.ndarray, dt: float, observed: Step
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions [N, 3] and F [N, 3, 3], float32, of the carriers `ids` after the next frame step of `dt` seconds.
 
-        ids: ascending, of carriers of the start or of the call before; others leave the simulation. control, factor: u
-        of the step in voxels per frame (see `velocity_at`), looked at in the first step only, for the velocities then.
+        ids: ascending, of carriers of the start or of the call before; others leave the simulation. observed: the
+        motion of the step, looked at in the first step only, for the velocities then.
         """
         if self._velocities is None:
-            self._velocities = velocities_at(control, factor, self._positions) / dt
+            self._velocities = observed.velocity(self._positions) / dt
         keep = np.ones(len(self._positions), dtype=bool)
         keep[: len(self._ids)] = np.isin(self._ids, ids, assume_unique=True)
         moved = self._solver.step(self._positions[keep], self._velocities[keep], dt, deformation)

@@ -13,8 +13,8 @@ import torch
 from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.fit import Appearance
+from splashbench_methods.splashsplat.motion import Motion, falls_of
 from splashbench_methods.splashsplat.subframe import Track
-from splashbench_methods.splashsplat.velocity import velocities_at
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_npz, write_json
@@ -22,7 +22,7 @@ from splashbench.observe.grid import Grid
 from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles
 
-FORMAT = 2
+FORMAT = 3
 
 
 def _position_steps(grid: Grid) -> float:
@@ -54,16 +54,14 @@ def pack_phi(phi: np.ndarray) -> np.ndarray:
 class Liquid:
     """The dynamic foreground.
 
-    times: [T] seconds. grid: the transport grid. carriers: in store precision. velocities: float16 [T - 1, cx, cy,
-    cz, 3], voxels per frame. factor: transport voxels per control cell. phi: int8 [T, nx, ny, nz], see `pack_phi`.
-    carried: whether the velocities are what moved the carriers.
+    times: [T] seconds. grid: the transport grid. carriers, motion: in the precision of the files. phi: int8 [T, nx, ny,
+    nz], see `pack_phi`. carried: whether the motion is what moved the carriers.
     """
 
     times: np.ndarray
     grid: Grid
     carriers: Carriers
-    velocities: np.ndarray
-    factor: int
+    motion: Motion
     phi: np.ndarray
     appearance: Appearance
     carried: bool = True
@@ -74,21 +72,20 @@ class Liquid:
         times: np.ndarray,
         grid: Grid,
         carriers: Carriers,
-        velocities: np.ndarray,
-        factor: int,
+        motion: Motion,
         phi: np.ndarray,
         appearance: Appearance,
         carried: bool = True,
     ) -> Liquid:
-        """Bring the learned tables and velocities to the precision of the files."""
+        """Bring the learned tables and the motion to the precision of the files."""
         halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
         appearance = Appearance(halves[0], halves[1], appearance.decoder)
-        return cls(times, grid, carriers, velocities.astype(np.float16), factor, phi, appearance, carried)
+        return cls(times, grid, carriers, motion.half(), phi, appearance, carried)
 
     @property
     def track(self) -> Track:
         """The carriers at any time."""
-        return Track(self.grid, self.carriers, self.velocities, self.factor, self.phi)
+        return Track(self.grid, self.carriers, self.motion, self.phi)
 
     def particles(self) -> Particles:
         """The carriers as particles, with the velocity of the liquid where they are, scene units per second.
@@ -108,8 +105,7 @@ class Liquid:
             if n_frames > 1 and len(ids):
                 step = min(t, n_frames - 2)  # the last frame has no step of its own
                 seconds = self.times[step + 1] - self.times[step]
-                control = self.velocities[step].astype(np.float32)
-                velocities[t, ids] = velocities_at(control, self.factor, x) * (self.grid.voxel / seconds)
+                velocities[t, ids] = self.motion.step(step).velocity(x) * (self.grid.voxel / seconds)
         return Particles(positions, active, velocities if self.carried else None)
 
     def signed_distance(self) -> SignedDistance | None:
@@ -127,7 +123,7 @@ class Liquid:
                 "voxel": self.grid.voxel,
                 "shape": list(self.grid.shape),
             },
-            "factor": self.factor,
+            "factor": self.motion.factor,
             "carriers": self.carriers.count,
             "carried": self.carried,
             "decoder": dict(vars(settings)),
@@ -143,7 +139,8 @@ class Liquid:
             deformation=carriers.deformation.astype(np.float16),
             phi=carriers.phi.astype(np.float16),
         )
-        np.savez_compressed(directory / "velocity.npz", velocities=self.velocities)
+        jets, turn = self.motion.table()
+        np.savez_compressed(directory / "velocity.npz", velocities=self.motion.velocities, jets=jets, turn=turn)
         np.savez_compressed(directory / "phi.npz", phi=self.phi)
         heads = {f"heads.{name}": value.numpy() for name, value in self.appearance.decoder.state_dict().items()}
         np.savez_compressed(
@@ -180,7 +177,14 @@ class Liquid:
             phi=rows["phi"].astype(np.float32),
             count=count,
         )
-        velocities = read_npz(directory / "velocity.npz", {"velocities": 5})["velocities"]
+        moves = read_npz(directory / "velocity.npz", {"velocities": 5, "jets": 2, "turn": 2})
+        try:
+            falls = falls_of(moves["jets"], moves["turn"], grid, times)
+        except ValueError as error:
+            raise SplashbenchError(
+                f"{directory / 'velocity.npz'} does not fit liquid.json ({error}); fit the scene again"
+            ) from None
+        motion = Motion(moves["velocities"], factor, falls)
         phi = read_npz(directory / "phi.npz", {"phi": 4})["phi"]
         shapes = {f"heads.{name}": value.ndim for name, value in decoder.state_dict().items()}
         tables = read_npz(directory / "appearance.npz", {"features": 2, "log_scales": 2, **shapes})
@@ -195,4 +199,4 @@ class Liquid:
             torch.from_numpy(tables["log_scales"].astype(np.float32)),
             decoder,
         )
-        return cls(times, grid, carriers, velocities, factor, phi, appearance, carried)
+        return cls(times, grid, carriers, motion, phi, appearance, carried)

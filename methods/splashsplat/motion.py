@@ -1,66 +1,150 @@
-"""Which motion goes where: the jet's where liquid falls, the level set's where it beats standing still, none elsewhere.
+"""What moves the liquid between two frames: free fall in the jet, the fitted velocity elsewhere.
 
-The level-set fit (velocity.py) sees the hull's surface only. In a steady jet nothing of that surface moves; where
-phantom volume comes and goes, it moves and no liquid does. The paper uses the fit everywhere.
+The level-set fit (velocity.py) sees the hull's surface only. In a steady jet nothing of that surface moves, but its
+liquid falls (ballistic.py). Which of the two a carrier follows is told where the carrier is, not on the coarse control
+grid: a jet's speed would spread from there to what splashes beside its foot. The paper uses the fit everywhere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
-from scipy.ndimage import gaussian_filter
 from splashbench_methods.splashsplat.ballistic import Jet
-from splashbench_methods.splashsplat.transport import forecast
+from splashbench_methods.splashsplat.transport import clamp_stretch, forecast
+from splashbench_methods.splashsplat.velocity import velocities_at
 
 from splashbench.observe.grid import Grid
-from splashbench.observe.kernels import sample
 
-# A fit must bring the liquid's nodes so much nearer to the next observation, on average, to be trusted (voxels).
-_GAIN = 0.02
-_SHELL = 3.0
-
-
-def control_nodes(shape: tuple[int, int, int], factor: int) -> np.ndarray:
-    """Transport-grid coordinates of the nodes of a control grid of `shape`, float64 [cx, cy, cz, 3]."""
-    axes = [np.arange(n) * factor + 0.5 * (factor - 1) for n in shape]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+# Liquid so near to a jet's side (voxels) is the jet's: its radius is not known any better.
+_MARGIN = 1.0
+#: Columns of `Motion.table`.
+COLUMNS = 9
 
 
-def gated(control: np.ndarray, factor: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """`control` with zero where it does not bring the liquid of `before` nearer to `after` than no motion does.
+@dataclass(frozen=True)
+class Fall:
+    """How the jet falls during one step.
 
-    control: float32 [cx, cy, cz, 3] voxels per frame. before, after: phi_t and phi_{t+1}, float32 [nx, ny, nz] voxels.
+    floor: height down to which it flies freely, scene units. turn: [3, 3] scene axes to upright ones. grid: whose
+    coordinates positions are given in. seconds: that the step lasts.
     """
-    if not np.any(control):
-        return control
-    coarse = control.shape[:3]
-    size = int(np.prod(coarse))
-    gains, counts = np.zeros(size), np.zeros(size)
-    # Forwards from what is liquid now, which shows where it leaves, and backwards from what will be, where it arrives.
-    for here, there, direction in ((before, after, 1), (after, before, -1)):
-        nodes = np.argwhere((here <= 0) & (here >= -_SHELL)).astype(np.float32)
-        identity = np.broadcast_to(np.eye(3, dtype=np.float32), (len(nodes), 3, 3))
-        moved, _ = forecast(direction * control, factor, nodes, identity)
-        gain = np.maximum(sample(there, nodes), 0) - np.maximum(sample(there, moved), 0)
-        cell = np.ravel_multi_index(tuple(np.minimum(nodes.astype(int) // factor, np.array(coarse) - 1).T), coarse)
-        gains += np.bincount(cell, gain, minlength=size)
-        counts += np.bincount(cell, minlength=size)
-    gains, counts = (gaussian_filter(values.reshape(coarse), 1.0) for values in (gains, counts))
-    trusted = gains > _GAIN * counts
-    return np.where(trusted[..., None], control, np.float32(0))
+
+    jet: Jet
+    floor: float
+    turn: np.ndarray
+    grid: Grid
+    seconds: float
+
+    def holds(self, positions: np.ndarray) -> np.ndarray:
+        """Which of `positions` [N, 3] are in the jet: bool [N]."""
+        points = self._upright(positions)
+        return (self.jet.distance(points) < _MARGIN * self.grid.voxel) & (points[:, 2] > self.floor)
+
+    def velocity(self, positions: np.ndarray) -> np.ndarray:
+        """Of the jet's liquid at `positions` [N, 3]: voxels per frame, float64 [N, 3]."""
+        per_second = self.jet.velocity(self._upright(positions)[:, 2])
+        return per_second @ self.turn * (self.seconds / self.grid.voxel)
+
+    def forecast(
+        self, positions: np.ndarray, deformation: np.ndarray, duration: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where carriers [N, 3] in the jet are after `duration` frames on their parabola, and F [N, 3, 3] then."""
+        seconds = duration * self.seconds
+        height = self._upright(positions)[:, 2]
+        moved = self.jet.velocity(height) * seconds
+        moved[:, 2] -= 0.5 * self.jet.gravity * seconds**2
+        # Of the velocity's gradient, only how the speed grows on the way down is not zero.
+        stretch = np.einsum("n,a,b->nab", self.jet.growth(height) * seconds, self.turn[2], self.turn[2])
+        deformed = deformation + stretch @ deformation
+        landed = positions + (moved @ self.turn / self.grid.voxel)
+        return landed.astype(np.float32), clamp_stretch(deformed)
+
+    def _upright(self, positions: np.ndarray) -> np.ndarray:
+        return self.grid.to_scene(positions) @ self.turn.T
 
 
-def with_jet(
-    control: np.ndarray, factor: int, grid: Grid, turn: np.ndarray, jet: Jet, floor: float, duration: float
-) -> np.ndarray:
-    """`control` with the jet's velocity at the nodes about it, above height `floor` (scene units).
+@dataclass(frozen=True)
+class Step:
+    """Between two frames. control: float32 [cx, cy, cz, 3], u_t in voxels per frame on a grid that is `factor` times
+    coarser than the transport grid; fall: of the jet, None without one."""
 
-    turn: [3, 3] scene axes to upright ones. duration: of the frame, seconds.
+    control: np.ndarray
+    factor: int
+    fall: Fall | None = None
+
+    def velocity(self, positions: np.ndarray) -> np.ndarray:
+        """At transport-grid `positions` [N, 3]: voxels per frame, float64 [N, 3]."""
+        velocities = velocities_at(self.control, self.factor, positions)
+        if self.fall is not None:
+            falls = self.fall.holds(positions)
+            velocities[falls] = self.fall.velocity(positions[falls])
+        return velocities
+
+    def forecast(
+        self, positions: np.ndarray, deformation: np.ndarray, duration: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where carriers [N, 3] with F [N, 3, 3] are after `duration` frames, and their F then; see transport.py.
+
+        A carrier falls if half way it is still in the jet: one that would land before is carried by what moves there.
+        """
+        moved, deformed = forecast(self.control, self.factor, positions, deformation, duration)
+        if self.fall is not None:
+            falls = np.flatnonzero(self.fall.holds(positions))
+            half_way, _ = self.fall.forecast(positions[falls], deformation[falls], 0.5 * duration)
+            falls = falls[self.fall.holds(half_way)]
+            moved[falls], deformed[falls] = self.fall.forecast(positions[falls], deformation[falls], duration)
+        return moved, deformed
+
+
+@dataclass(frozen=True)
+class Motion:
+    """All steps of a sequence.
+
+    velocities: [T - 1, cx, cy, cz, 3], voxels per frame, on a grid that is `factor` times coarser than the transport
+    grid. falls: of the jet in each step, None without one.
     """
-    shape = control.shape[:3]
-    points = grid.to_scene(control_nodes((shape[0], shape[1], shape[2]), factor)).reshape(-1, 3) @ turn.T
-    # All eight nodes about any point of the jet, so that no other motion is mixed in.
-    reach = 1.8 * factor * grid.voxel
-    near = (jet.distance(points) < reach) & (points[:, 2] > floor + 0.5 * factor * grid.voxel)
-    moving = control.reshape(-1, 3).copy()
-    moving[near] = jet.velocity(points[near, 2]) @ turn * (duration / grid.voxel)
-    return moving.reshape(control.shape)
+
+    velocities: np.ndarray
+    factor: int
+    falls: Sequence[Fall | None]
+
+    def step(self, t: int) -> Step:
+        """From frame `t` to the next."""
+        return Step(self.velocities[t].astype(np.float32, copy=False), self.factor, self.falls[t])
+
+    def half(self) -> Motion:
+        """In the precision of the files."""
+        return replace(self, velocities=self.velocities.astype(np.float16))
+
+    def table(self) -> tuple[np.ndarray, np.ndarray]:
+        """The falls as numbers: float64 [T - 1, 9], zeros without a jet, and what turns scene axes upright, [3, 3].
+
+        A row has the jet's top, middle (2), drift (2), speed, gravity and radius, and the floor: scene units, seconds.
+        """
+        rows = np.zeros((len(self.falls), COLUMNS))
+        turn = np.eye(3)
+        for row, fall in zip(rows, self.falls):
+            if fall is not None:
+                jet, turn = fall.jet, fall.turn
+                row[:] = [jet.top, *jet.middle, *jet.drift, jet.speed, jet.gravity, jet.radius, fall.floor]
+        return rows, turn
+
+
+def falls_of(rows: np.ndarray, turn: np.ndarray, grid: Grid, times: np.ndarray) -> list[Fall | None]:
+    """What `Motion.table` made its numbers of; times: [T] of the frames, seconds.
+
+    Raises ValueError where they are of another shape or sequence.
+    """
+    if rows.shape != (max(len(times) - 1, 0), COLUMNS) or turn.shape != (3, 3):
+        raise ValueError(f"jets of shape {rows.shape} do not fit {len(times)} frames")
+    falls: list[Fall | None] = []
+    for row, seconds in zip(rows, np.diff(times)):
+        top, speed, gravity, radius, floor = (float(row[n]) for n in (0, 5, 6, 7, 8))
+        if speed == 0:
+            falls.append(None)
+        else:
+            jet = Jet(top, row[1:3], row[3:5], speed, gravity, radius)
+            falls.append(Fall(jet, floor, turn, grid, float(seconds)))
+    return falls

@@ -15,8 +15,9 @@ from splashbench_methods.splashsplat.fit import (
     visible_carriers,
 )
 from splashbench_methods.splashsplat.flip import FlipSolver, FlipTransport, gravity_in_voxels
+from splashbench_methods.splashsplat.gate import gated
 from splashbench_methods.splashsplat.model import Liquid, pack_phi, store_precision
-from splashbench_methods.splashsplat.motion import gated, with_jet
+from splashbench_methods.splashsplat.motion import Fall, Motion
 from splashbench_methods.splashsplat.occlusion import Occlusion
 from splashbench_methods.splashsplat.subframe import Track
 from splashbench_methods.splashsplat.survey import Survey, survey
@@ -46,8 +47,8 @@ SEEN_THROUGH = 1.5
 class Observations:
     """phi_t of one frame after another, and on the way the motion between them; two frames in memory at a time.
 
-    Iterating yields phi_t on `hull_grid`, float32 in transport voxels. By the time phi_t is yielded, velocities[t - 1]
-    (float32 [T - 1, cx, cy, cz, 3], voxels per frame) and packed[t] (int8, see `pack_phi`) are filled in.
+    Iterating yields phi_t on `hull_grid`, float32 in transport voxels. By the time phi_t is yielded, step t - 1 of
+    `motion` and packed[t] (int8, see `pack_phi`) are filled in.
     """
 
     def __init__(self, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report) -> None:
@@ -88,7 +89,8 @@ class Observations:
                 )
         self.n_frames = scene.n_frames
         control = control_shape(self.grid.shape, config.control_factor)
-        self.velocities = np.zeros((self.n_frames - 1, *control, 3), dtype=np.float32)
+        velocities = np.zeros((self.n_frames - 1, *control, 3), dtype=np.float32)
+        self.motion = Motion(velocities, config.control_factor, [self._fall(t) for t in range(self.n_frames - 1)])
         self.packed = np.zeros((self.n_frames, *self.grid.shape), dtype=np.int8)
 
     def __iter__(self) -> Iterator[np.ndarray]:
@@ -106,23 +108,24 @@ class Observations:
                 self.packed[t] = pack_phi(now)
             with self._run.stage("velocity"):
                 if before is not None and config.variant != "per_frame":
-                    self.velocities[t - 1] = self._motion(before, now, t - 1)
+                    self.motion.velocities[t - 1] = self._fitted(before, now)
             before = now
             with self._run.stage("carriers"):  # what is done with phi until the next is asked for
                 yield phi
             self._report((t + 1) / self.n_frames, "signed distance, velocity, carriers")
 
-    def _motion(self, before: np.ndarray, after: np.ndarray, t: int) -> np.ndarray:
-        """u_t on the control grid, voxels per frame: the level set's, and where more is known, that (motion.py)."""
+    def _fitted(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """u_t on the control grid, voxels per frame."""
         config, factor = self._config, self._config.control_factor
         control = fit_velocity(before, after, factor, config.velocity).control
-        if config.gate_motion:
-            control = gated(control, factor, before, after)
-        jet = None if self._survey is None else self._survey.jets[t]
-        if self._survey is None or jet is None:
-            return control
-        duration = float(self._times[t + 1] - self._times[t])
-        return with_jet(control, factor, self.grid, self._survey.turn, jet, self._survey.jet_floor(t), duration)
+        return gated(control, factor, before, after) if config.gate_motion else control
+
+    def _fall(self, t: int) -> Fall | None:
+        """The jet's, from frame `t` to the next."""
+        found = self._survey
+        if found is None or (jet := found.jets[t]) is None or self._config.variant == "per_frame":
+            return None
+        return Fall(jet, found.jet_floor(t), found.turn, self.grid, float(self._times[t + 1] - self._times[t]))
 
     def landed(self, t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Where carriers that fly from `start` to `end` [N, 3] (transport grid) come to rest in frame `t`."""
@@ -138,7 +141,7 @@ class Observations:
             solver = FlipSolver(self.grid.shape, gravity, solid)
             ratio = self.grid.voxel / self.hull_grid.voxel
             transport = FlipTransport(solver, phi, ratio, ids, positions, np.random.default_rng([seed, 2]))
-            return _Steps(transport, np.diff(self._times), self.velocities, self._config.control_factor)
+            return _Steps(transport, np.diff(self._times), self.motion)
 
         return start
 
@@ -155,12 +158,10 @@ class _Steps:
 
     transport: FlipTransport
     durations: np.ndarray
-    velocities: np.ndarray
-    factor: int
+    motion: Motion
 
     def forecast(self, ids: np.ndarray, deformation: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-        duration = float(self.durations[step])
-        return self.transport.forecast(ids, deformation, duration, self.velocities[step], self.factor)
+        return self.transport.forecast(ids, deformation, float(self.durations[step]), self.motion.step(step))
 
 
 def fit_liquid(
@@ -179,13 +180,12 @@ def fit_liquid(
         run.progress(span[0] + (span[1] - span[0]) * fraction, message)
 
     observations = Observations(scene, config, run, lambda done, message: report(_TRACKING * done, message))
-    grid, factor, occlusion = observations.grid, config.control_factor, observations.occlusion
+    grid, motion, occlusion = observations.grid, observations.motion, observations.occlusion
     carriers = track_carriers(
         observations,
         observations.hull_grid,
         grid,
-        observations.velocities,
-        factor,
+        motion,
         config.carriers,
         run.seed,
         observations.seen if config.visible_only else None,
@@ -195,7 +195,7 @@ def fit_liquid(
     carriers = store_precision(carriers, grid)
     with run.stage("appearance"), one_torch_thread():
         appearance = initial_appearance(carriers.count, grid.voxel, config.optimisation, config.decoder, run.seed)
-        track = Track(grid, carriers, observations.velocities, factor, observations.packed)
+        track = Track(grid, carriers, motion, observations.packed)
         targets = collect_targets(
             scene,
             backgrounds,
@@ -218,8 +218,7 @@ def fit_liquid(
         carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
     # What moves the carriers of the other variants is not u_t.
     carried = config.variant in ("full", "no_resampling")
-    velocities, packed = observations.velocities, observations.packed
-    return Liquid.of(scene.times, grid, carriers, velocities, factor, packed, appearance, carried), occlusion
+    return Liquid.of(scene.times, grid, carriers, motion, observations.packed, appearance, carried), occlusion
 
 
 def _pruned(carriers: Carriers, appearance: Appearance, threshold: float) -> tuple[Carriers, Appearance]:

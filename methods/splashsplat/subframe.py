@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from splashbench_methods.splashsplat.carriers import Carriers
 from splashbench_methods.splashsplat.decoder import CarrierState
-from splashbench_methods.splashsplat.transport import forecast
+from splashbench_methods.splashsplat.motion import Motion
 from torch import Tensor
 
 from splashbench.observe.grid import Grid
@@ -44,13 +44,11 @@ def locate(times: np.ndarray, time: float) -> tuple[int, float]:
 
 @dataclass(frozen=True)
 class Track:
-    """Carriers and what moves them. velocities: [T - 1, cx, cy, cz, 3], voxels per frame, on a grid that is `factor`
-    times coarser than `grid`. phi: int8 [T, nx, ny, nz], see `model.pack_phi`."""
+    """Carriers and what moves them. phi: int8 [T, nx, ny, nz] on `grid`, see `model.pack_phi`."""
 
     grid: Grid
     carriers: Carriers
-    velocities: np.ndarray
-    factor: int
+    motion: Motion
     phi: np.ndarray
 
     def ids(self, t: int) -> Tensor:
@@ -64,8 +62,7 @@ class Track:
         phi = self.carriers.phi[rows]
         if fraction != 0 and len(positions):
             step, other = (t, t + 1) if fraction > 0 else (t - 1, t - 1)
-            control = self.velocities[step].astype(np.float32)
-            positions, deformation = forecast(control, self.factor, positions, deformation, fraction)
+            positions, deformation = self.motion.step(step).forecast(positions, deformation, fraction)
             here, there = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
             phi = ((1 - abs(fraction)) * here + abs(fraction) * there).astype(np.float32)
         scene_positions = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from splashbench_methods.splashsplat.ballistic import Jet, Slices, fit_jets, framed, open_floor, slices_of
-from splashbench_methods.splashsplat.motion import control_nodes, gated, with_jet
+from splashbench_methods.splashsplat.gate import gated
+from splashbench_methods.splashsplat.motion import Fall, Motion, Step, falls_of
 from splashbench_methods.splashsplat.pool import Pool, Vessel, upright
 from splashbench_methods.splashsplat.survey import survey
 from splashbench_methods.splashsplat.velocity import control_shape, velocity_at
@@ -156,19 +157,69 @@ def test_slices_cut_by_an_image_edge_are_left_out():
 # Motion
 
 
-def test_the_jets_velocity_is_laid_on_the_control_grid():
-    grid = Grid(np.array([-0.1, 0.0, -0.1]), VOXEL, (40, 64, 40))
-    jet = Jet(0.3, np.array([0.0, 0.0]), np.array([0.2, -0.1]), 1.0, G, 0.01)
-    turn = upright(DOWN)
-    control = np.zeros((*control_shape(grid.shape, 4), 3), np.float32)
-    moving = with_jet(control, 4, grid, turn, jet, 0.1, 0.033)
-    for height in (0.15, 0.25):
-        middle = np.append(jet.axis(np.array(height)), height) @ turn
-        found = np.array(velocity_at(moving, 4, *map(float, grid.to_voxels(middle)))) * VOXEL / 0.033
-        np.testing.assert_allclose(found, jet.velocity(np.array(height)) @ turn, rtol=0.02, atol=0.02)
-    assert (control == 0).all()
-    low = grid.to_scene(control_nodes(control.shape[:3], 4))[..., 1] < 0.1
-    assert (moving[low] == 0).all()
+GRID = Grid(np.array([-0.1, 0.0, -0.1]), VOXEL, (40, 64, 40))
+JET = Jet(0.3, np.array([0.0, 0.0]), np.array([0.2, -0.1]), 1.0, G, 0.01)
+FALL = Fall(JET, 0.1, upright(DOWN), GRID, 0.033)
+SIDEWAYS = np.broadcast_to(np.float32([1, 0, 0]), (*control_shape(GRID.shape, 4), 3))
+
+
+def in_the_jet(heights: np.ndarray, aside: float = 0.0) -> np.ndarray:
+    """Grid coordinates [N, 3] at `heights`, so far (scene units) beside the jet's middle."""
+    points = np.concatenate([JET.axis(heights) + np.array([aside, 0]), heights[:, None]], axis=1)
+    return GRID.to_voxels(points @ upright(DOWN)).astype(np.float32)
+
+
+def eyes(count: int) -> np.ndarray:
+    return np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
+
+
+def test_what_is_in_the_jet_falls_and_what_is_beside_it_follows_the_fit():
+    heights = np.array([0.15, 0.2, 0.25])
+    step = Step(SIDEWAYS, 4, FALL)
+    found = step.velocity(in_the_jet(heights)) * VOXEL / 0.033
+    np.testing.assert_allclose(found, JET.velocity(heights) @ upright(DOWN), rtol=1e-5)
+    for elsewhere in (in_the_jet(heights, aside=0.011 + VOXEL), in_the_jet(np.array([0.05, 0.09]))):
+        np.testing.assert_array_equal(step.velocity(elsewhere), np.broadcast_to([1.0, 0, 0], elsewhere.shape))
+        moved, F = step.forecast(elsewhere, eyes(len(elsewhere)))
+        np.testing.assert_allclose(moved, elsewhere + np.array([1, 0, 0]), atol=1e-5)
+        np.testing.assert_allclose(F, eyes(len(elsewhere)), atol=1e-6)
+
+
+def test_carriers_in_the_jet_fly_on_their_parabola_and_stretch():
+    start = in_the_jet(np.array([0.26]))
+    moved, F = Step(SIDEWAYS, 4, FALL).forecast(start, eyes(1))
+    rise = np.array([0.0, 0.0, 1.0]) @ upright(DOWN)
+    way = JET.velocity(np.array([0.26])) @ upright(DOWN) * 0.033 - 0.5 * G * 0.033**2 * rise
+    np.testing.assert_allclose(moved, start + way / VOXEL, atol=1e-4)
+    # It is still in the middle of the jet, and has the speed that the jet has there.
+    height = (GRID.to_scene(moved) @ upright(DOWN).T)[:, 2]
+    np.testing.assert_allclose(moved, in_the_jet(height), atol=1e-3)
+    # Two carriers on top of each other part as F says: speeds grow downwards.
+    tip = 1e-2 * rise / VOXEL
+    apart = (Step(SIDEWAYS, 4, FALL).forecast(start + tip.astype(np.float32), eyes(1))[0] - moved) / 1e-2 * VOXEL
+    np.testing.assert_allclose(F[0] @ rise, apart[0], atol=0.02)
+    assert F[0] @ rise @ rise > 1.05
+    # One that lands within the first half of the step is left to the fit.
+    low = in_the_jet(np.array([0.1 + 0.4 * 0.033 * 1.0]))
+    np.testing.assert_allclose(Step(SIDEWAYS, 4, FALL).forecast(low, eyes(1))[0], low + np.array([1, 0, 0]), atol=1e-5)
+    # Halves of a step, forwards or backwards, make whole ones.
+    half = Step(SIDEWAYS, 4, FALL).forecast(*Step(SIDEWAYS, 4, FALL).forecast(start, eyes(1), 0.5), 0.5)[0]
+    np.testing.assert_allclose(half, moved, atol=1e-3)
+    back = Step(SIDEWAYS, 4, FALL).forecast(moved, eyes(1), -1.0)[0]
+    np.testing.assert_allclose(back, start, atol=1e-3)
+
+
+def test_motion_is_read_as_it_was_written():
+    motion = Motion(np.stack([SIDEWAYS, SIDEWAYS]), 4, [None, FALL])
+    again = falls_of(*motion.table(), GRID, np.array([0.0, 0.1, 0.133]))
+    assert again[0] is None
+    assert again[1] is not None
+    points = in_the_jet(np.array([0.15, 0.25]))
+    np.testing.assert_allclose(again[1].velocity(points), FALL.velocity(points), rtol=1e-12)
+    np.testing.assert_array_equal(again[1].holds(points), [True, True])
+    assert motion.half().velocities.dtype == np.float16
+    with pytest.raises(ValueError, match="jets of shape"):
+        falls_of(*motion.table(), GRID, np.array([0.0, 0.1]))
 
 
 def test_a_fit_that_leads_nowhere_is_dropped_and_one_that_leads_home_is_kept():
@@ -182,6 +233,9 @@ def test_a_fit_that_leads_nowhere_is_dropped_and_one_that_leads_home_is_kept():
     kept = gated(right, 4, ball(17), ball(20))
     assert velocity_at(kept, 4, 24.0, 20.0, 20.0)[0] == pytest.approx(3)
     assert np.abs(velocity_at(gated(right, 4, ball(17), ball(17)), 4, 17.0, 20.0, 20.0)).max() == 0
+    # A slow surface gains next to nothing by its own motion, and keeps it.
+    slow = 0.02 * right
+    assert velocity_at(gated(slow, 4, ball(17), ball(17.06)), 4, 20.0, 20.0, 20.0)[0] == pytest.approx(0.06)
 
 
 # The pool

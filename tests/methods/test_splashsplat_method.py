@@ -13,7 +13,6 @@ from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, Spla
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.reconstruct import fit_liquid
 from splashbench_methods.splashsplat.subframe import locate
-from splashbench_methods.splashsplat.transport import forecast
 
 from splashbench.adapter.contract import Run
 from splashbench.scene import Scene
@@ -105,7 +104,7 @@ def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, f
         rows, lives = liquid.carriers.rows(t), alive[t, liquid.carriers.ids[liquid.carriers.rows(t)]]
         x, F = liquid.carriers.positions[rows][lives], liquid.carriers.deformation[rows][lives]
         ids = liquid.carriers.ids[rows][lives]
-        there, _ = forecast(liquid.velocities[t].astype(np.float32), liquid.factor, x, F)
+        there, _ = liquid.motion.step(t).forecast(x, F)
         off = np.linalg.norm(liquid.grid.to_voxels(particles.positions[t + 1, ids]) - there, axis=1)
         assert off.max() <= 1.05
 
@@ -194,7 +193,7 @@ def test_the_same_seed_gives_the_same_liquid_bit_for_bit(balls: Scene):
     first, second, other = liquid_only(balls), liquid_only(balls), liquid_only(balls, seed=2)
     assert torch.equal(first.appearance.features, second.appearance.features)
     np.testing.assert_array_equal(first.carriers.positions, second.carriers.positions)
-    np.testing.assert_array_equal(first.velocities, second.velocities)
+    np.testing.assert_array_equal(first.motion.velocities, second.motion.velocities)
     assert not torch.equal(first.appearance.features[:100], other.appearance.features[:100])
 
 
@@ -206,7 +205,7 @@ def test_the_ablations_differ_as_the_paper_says(balls: Scene):
     active = [np.diff(liquid.carriers.starts)[last] for liquid in (full, alone, anew)]
     assert active[1] < 0.7 * active[0]  # without resampling carriers die out
     assert full.carriers.count < 0.9 * anew.carriers.count  # transport stores fewer than reseeding
-    assert (anew.velocities == 0).all()
+    assert (anew.motion.velocities == 0).all()
 
 
 def test_transparent_carriers_are_dropped(balls: Scene):

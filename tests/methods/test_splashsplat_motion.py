@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from splashbench_methods.splashsplat.carriers import Carriers, CarrierSettings, track_carriers
+from splashbench_methods.splashsplat.motion import Motion
 from splashbench_methods.splashsplat.resample import ShellSettings, cell_of, newborns, within_capacity
 from splashbench_methods.splashsplat.transport import clamp_stretch, correct, forecast
 from splashbench_methods.splashsplat.velocity import (
@@ -161,7 +162,8 @@ def track(fields, velocities=None, **settings) -> Carriers:
     pairs = len(fields) - 1
     if velocities is None:
         velocities = np.zeros((pairs, *control_shape((SIZE,) * 3, FACTOR), 3), dtype=np.float32)
-    return track_carriers(fields, GRID, GRID, velocities, FACTOR, CarrierSettings(shell=SHELL, **settings), seed=3)
+    motion = Motion(velocities, FACTOR, [None] * pairs)
+    return track_carriers(fields, GRID, GRID, motion, CarrierSettings(shell=SHELL, **settings), seed=3)
 
 
 def test_newborns_fill_the_shell_and_nothing_else():

@@ -286,7 +286,7 @@ def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    "name", ["ablation", "masks", "views", "sensitivity", "best", "lifetimes", "baselines", "interpolation"]
+    "name", ["ablation", "masks", "views", "sensitivity", "best", "presets", "baselines", "interpolation"]
 )
 def test_the_shipped_studies_fit_the_method(name: str, balls_directory: Path) -> None:
     assert name in shipped()
