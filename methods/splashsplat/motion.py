@@ -135,7 +135,7 @@ class Motion:
 def falls_of(rows: np.ndarray, turn: np.ndarray, grid: Grid, times: np.ndarray) -> list[Fall | None]:
     """What `Motion.table` made its numbers of; times: [T] of the frames, seconds.
 
-    Raises ValueError where they are of another shape or sequence.
+    Raises ValueError where they are no such numbers.
     """
     if rows.shape != (max(len(times) - 1, 0), COLUMNS) or turn.shape != (3, 3):
         raise ValueError(f"jets of shape {rows.shape} do not fit {len(times)} frames")
@@ -144,6 +144,8 @@ def falls_of(rows: np.ndarray, turn: np.ndarray, grid: Grid, times: np.ndarray) 
         top, speed, gravity, radius, floor = (float(row[n]) for n in (0, 5, 6, 7, 8))
         if speed == 0:
             falls.append(None)
+        elif min(speed, gravity, radius) <= 0:
+            raise ValueError("a jet's speed, gravity and radius are not positive")
         else:
             jet = Jet(top, row[1:3], row[3:5], speed, gravity, radius)
             falls.append(Fall(jet, floor, turn, grid, float(seconds)))

@@ -220,6 +220,10 @@ def test_motion_is_read_as_it_was_written():
     assert motion.half().velocities.dtype == np.float16
     with pytest.raises(ValueError, match="jets of shape"):
         falls_of(*motion.table(), GRID, np.array([0.0, 0.1]))
+    rows, turn = motion.table()
+    rows[1, 6] = 0
+    with pytest.raises(ValueError, match="gravity"):
+        falls_of(rows, turn, GRID, np.array([0.0, 0.1, 0.133]))
 
 
 def test_a_fit_that_leads_nowhere_is_dropped_and_one_that_leads_home_is_kept():
