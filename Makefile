@@ -5,6 +5,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# A file's tests stay together: they share scenes that take long to make. A worker may take 1 GB.
+PYTEST := $(BIN)/python -m pytest -q --durations=15 -n auto --maxprocesses=4 --dist=loadfile
 
 # A PYTHON that somebody chose is taken at its word; the default gives way to any supported one that is there.
 CANDIDATES := $(if $(filter file,$(origin PYTHON)),python3 python3.13 python3.12 python3.11 python3.10,$(PYTHON))
@@ -33,11 +35,11 @@ demo: .venv/installed-synth
 
 test: .venv/installed-test
 	@echo "==> Running the tests"
-	$(BIN)/python -m pytest -q -m "not slow and not cuda" --durations=15
+	$(PYTEST) -m "not slow and not cuda"
 
 test-all: .venv/installed-test
 	@echo "==> Running every test"
-	$(BIN)/python -m pytest -q --durations=15
+	$(PYTEST)
 
 lint: .venv/installed-dev
 	@echo "==> Checking style and types"
