@@ -30,7 +30,8 @@ METHODS = Path(__file__).parents[1] / "adapter" / "example_methods.py"
 GOOD = f"import sys\nsys.path.insert(0, {str(METHODS.parent)!r})\nfrom example_methods import Good\n"
 # As large as a disk that is nearly full: every file beyond it fails with EFBIG (Python ignores SIGXFSZ).
 DISK_OF = (
-    "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0})); "
+    # Python would cache half a module, and load it from then on.
+    "import resource, sys; sys.dont_write_bytecode = True; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0})); "
     "from splashbench.cli.main import main; sys.exit(main(sys.argv[1:]))"
 )
 
