@@ -5,8 +5,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-# A file's tests stay together: they share scenes that take long to make. A worker may take 1 GB.
-PYTEST := $(BIN)/python -m pytest -q --durations=15 -n auto --maxprocesses=4 --dist=loadfile
+PYTEST := $(BIN)/python -m pytest -q --durations=15
 
 # A PYTHON that somebody chose is taken at its word; the default gives way to any supported one that is there.
 CANDIDATES := $(if $(filter file,$(origin PYTHON)),python3 python3.13 python3.12 python3.11 python3.10,$(PYTHON))
@@ -33,9 +32,10 @@ demo: .venv/installed-synth
 	@echo "==> Running the demo"
 	$(BIN)/splashbench demo demo_output
 
+# A file's tests stay together: they share scenes that take long to make. A worker may take 1 GB; slow tests take more.
 test: .venv/installed-test
 	@echo "==> Running the tests"
-	$(PYTEST) -m "not slow and not cuda"
+	$(PYTEST) -m "not slow and not cuda" -n auto --maxprocesses=4 --dist=loadfile
 
 test-all: .venv/installed-test
 	@echo "==> Running every test"

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-import torch
 from splashbench_methods.deformable_3dgs.model import ROWS, DeformableModel
 from splashbench_methods.deformable_3dgs.settings import Settings
 from splashbench_methods.gaussian_splatting.density import DensityControl
@@ -14,11 +13,10 @@ from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
 from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
 from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
 from splashbench_methods.gaussian_splatting.photographs import Photographs
-from splashbench_methods.gaussian_splatting.start import camera_extent, hull_points, joined, static_points
+from splashbench_methods.gaussian_splatting.start import camera_extent, started
 
 from splashbench.adapter.contract import Method, MethodConfig, Run
 from splashbench.files import read_npz
-from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import TrainingScene
 
 
@@ -49,15 +47,8 @@ class Deformable3DGS(Method):
     mixed: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
-        rng = np.random.default_rng(run.seed)
-        run.progress(0, "collecting points")
-        with one_torch_thread(), torch.random.fork_rng(devices=[]):
-            torch.manual_seed(run.seed)
-            with run.stage("start"):
-                static = static_points(scene, config.static_points, config.static, rng)
-                # One canonical set for all times: points of several frames would all be there in every one.
-                liquid = hull_points(scene, config.hull_points, largest_only=True)
-                start = joined(static, liquid)
+        # One canonical set for all times: points of several frames would all be there in every one.
+        with started(scene, config, run, largest_only=True) as (start, rng):
             model = DeformableModel.from_start(
                 start, config.start_opacity, config.sh_degree, config.depth, config.width
             )

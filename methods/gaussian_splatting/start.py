@@ -7,17 +7,22 @@ their depth (scaffold_gs/anchors.py).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from splashbench_methods.scaffold_gs.anchors import seed_anchors, sparse_anchors
 from splashbench_methods.scaffold_gs.plate import make_plate
 
+from splashbench.adapter.contract import Run
 from splashbench.errors import SplashbenchError
 from splashbench.observe.initial_points import initial_points
+from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import TrainingScene
 
 _PLATE_SIDE = 800
@@ -38,6 +43,32 @@ class Start:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+
+class StartSettings(Protocol):
+    """What a method's settings say of its start; see settings.py."""
+
+    static: Literal["pixels", "points"]
+    static_points: int
+    hull_points: int
+
+
+@contextmanager
+def started(
+    scene: TrainingScene, settings: StartSettings, run: Run, largest_only: bool = False
+) -> Iterator[tuple[Start, np.random.Generator]]:
+    """All points that a fit starts from, and the generator of its random numbers; within, torch is seeded as well.
+
+    largest_only: see `hull_points`.
+    """
+    rng = np.random.default_rng(run.seed)
+    run.progress(0, "collecting points")
+    with one_torch_thread(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(run.seed)
+        with run.stage("start"):
+            static = static_points(scene, settings.static_points, settings.static, rng)
+            start = joined(static, hull_points(scene, settings.hull_points, largest_only))
+        yield start, rng
 
 
 def static_points(

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,6 +27,8 @@ from splashbench_methods.gaussian_splatting.start import Start
 from splashbench_methods.scaffold_gs.model import FEATURES, PER_ANCHOR, Anchors, head, random_offsets
 from torch import Tensor, nn
 
+from splashbench.errors import SplashbenchError
+from splashbench.files import read_npz
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
 
@@ -34,6 +37,8 @@ ROWS = ("positions", *PER_ANCHOR)
 # Channels of the shape head, per child: scales, inverse duration, quaternion.
 _SHAPE = 8
 _VOLUME_WEIGHT = 0.01
+#: Children that an anchor of a file may have.
+MAX_CHILDREN = 1024
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,14 @@ class Variant:
     beta: float = 4.0
     fastest: float = 1.0
     base_color: bool = False
+
+
+def stored_children(path: Path) -> int:
+    """Children per anchor of the tables in `path`. Raises SplashbenchError naming it where they make no sense."""
+    children = read_npz(path, {"offsets": 3})["offsets"].shape[1]
+    if not 1 <= children <= MAX_CHILDREN:
+        raise SplashbenchError(f"{path}: {children} Gaussians per anchor make no sense; make the model again")
+    return int(children)
 
 
 @dataclass

@@ -31,13 +31,21 @@ from splashbench_methods.gaussian_splatting.official import (
     require_finite,
 )
 from splashbench_methods.gaussian_splatting.point_cloud import PointCloud, read_point_cloud
-from splashbench_methods.scaffold_4d.model import ROWS, AnchorSplats, SpacetimeAnchors, State, Variant
+from splashbench_methods.scaffold_4d.model import (
+    MAX_CHILDREN,
+    ROWS,
+    AnchorSplats,
+    SpacetimeAnchors,
+    State,
+    Variant,
+    stored_children,
+)
 from splashbench_methods.scaffold_gs.model import FEATURES
 from torch import Tensor, nn
 
 from splashbench.adapter.importers import Importer
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_model, read_npz
+from splashbench.files import read_model
 from splashbench.render.constants import BLUR_VARIANCE, JACOBIAN_MARGIN
 from splashbench.scene import Camera, TrainingScene
 from splashbench.scene.exporting.records import FACTS, Facts
@@ -48,7 +56,6 @@ _OTHER_MODELS = ("use_feat_bank", "add_opacity_dist", "add_cov_dist", "add_color
 _TANGENT = math.tan(0.5)
 _SLOPE = 1.3 * _TANGENT
 _TILE = 16
-_MAX_CHILDREN = 1024
 
 
 class OfficialAnchors(OfficialModel, SpacetimeAnchors):
@@ -151,10 +158,7 @@ class OfficialScaffold4D(Importer):
 
     def load(self, directory: Path, scene: TrainingScene) -> OfficialFitted:
         path = directory / MODEL_FILE
-        children = read_npz(path, {"offsets": 3})["offsets"].shape[1]
-        if not 1 <= children <= _MAX_CHILDREN:
-            raise SplashbenchError(f"{path}: {children} Gaussians per anchor make no sense; import again")
-        model = OfficialAnchors(0, Variant(children))
+        model = OfficialAnchors(0, Variant(stored_children(path)))
         load_tables(path, model, ROWS)
         return OfficialFitted(model, scene)
 
@@ -163,7 +167,7 @@ def _anchors(cloud: PointCloud, beta: float, fastest: float) -> OfficialAnchors:
     """The cloud's anchors; the weights of the heads are still to come."""
     offsets, features = cloud.count("f_offset_"), cloud.count("f_anchor_feat_")
     children = offsets // 4
-    if offsets % 4 or not 1 <= children <= _MAX_CHILDREN or features != FEATURES:
+    if offsets % 4 or not 1 <= children <= MAX_CHILDREN or features != FEATURES:
         raise SplashbenchError(
             f"{cloud.path} has {offsets} properties f_offset_ and {features} f_anchor_feat_, not 4 per Gaussian and "
             f"{FEATURES}; train with the published sizes"

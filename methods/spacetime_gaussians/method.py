@@ -12,14 +12,13 @@ from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
 from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
 from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
 from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
-from splashbench_methods.gaussian_splatting.start import camera_extent, hull_points, joined, static_points
+from splashbench_methods.gaussian_splatting.start import camera_extent, started
 from splashbench_methods.spacetime_gaussians.guided import GuidedDensity
 from splashbench_methods.spacetime_gaussians.model import SpacetimeModel
 from splashbench_methods.spacetime_gaussians.settings import Settings
 from torch import Tensor
 
 from splashbench.adapter.contract import Method, MethodConfig, Run
-from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import TrainingScene
 
 
@@ -59,13 +58,7 @@ class SpacetimeGaussians(Method):
     full: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
-        rng = np.random.default_rng(run.seed)
-        run.progress(0, "collecting points")
-        with one_torch_thread(), torch.random.fork_rng(devices=[]):
-            torch.manual_seed(run.seed)
-            with run.stage("start"):
-                static = static_points(scene, config.static_points, config.static, rng)
-                start = joined(static, hull_points(scene, config.hull_points))
+        with started(scene, config, run) as (start, rng):
             times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
             model = SpacetimeModel.from_start(start, self.full, config.start_opacity, config.hull_log_width, times)
             extent = camera_extent(scene)

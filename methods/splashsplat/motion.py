@@ -19,8 +19,8 @@ from splashbench.observe.grid import Grid
 
 # Liquid so near to a jet's side (voxels) is the jet's: its radius is not known any better.
 _MARGIN = 1.0
-#: Columns of `Motion.table`.
-COLUMNS = 9
+# Columns of `Motion.table`.
+_COLUMNS = 9
 
 
 @dataclass(frozen=True)
@@ -47,19 +47,18 @@ class Fall:
         per_second = self.jet.velocity(self._upright(positions)[:, 2])
         return per_second @ self.turn * (self.seconds / self.grid.voxel)
 
-    def forecast(
-        self, positions: np.ndarray, deformation: np.ndarray, duration: float = 1.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Where carriers [N, 3] in the jet are after `duration` frames on their parabola, and F [N, 3, 3] then."""
+    def moved(self, positions: np.ndarray, duration: float) -> np.ndarray:
+        """Where carriers [N, 3] in the jet are after `duration` frames on their parabola: float32 [N, 3]."""
         seconds = duration * self.seconds
-        height = self._upright(positions)[:, 2]
-        moved = self.jet.velocity(height) * seconds
-        moved[:, 2] -= 0.5 * self.jet.gravity * seconds**2
+        way = self.jet.velocity(self._upright(positions)[:, 2]) * seconds
+        way[:, 2] -= 0.5 * self.jet.gravity * seconds**2
+        return (positions + way @ self.turn / self.grid.voxel).astype(np.float32)
+
+    def deformed(self, positions: np.ndarray, deformation: np.ndarray, duration: float) -> np.ndarray:
+        """F [N, 3, 3] then, of carriers that start at `positions` with F `deformation`."""
         # Of the velocity's gradient, only how the speed grows on the way down is not zero.
-        stretch = np.einsum("n,a,b->nab", self.jet.growth(height) * seconds, self.turn[2], self.turn[2])
-        deformed = deformation + stretch @ deformation
-        landed = positions + (moved @ self.turn / self.grid.voxel)
-        return landed.astype(np.float32), clamp_stretch(deformed)
+        growth = self.jet.growth(self._upright(positions)[:, 2]) * (duration * self.seconds)
+        return clamp_stretch(deformation + np.einsum("n,a,b->nab", growth, self.turn[2], self.turn[2]) @ deformation)
 
     def _upright(self, positions: np.ndarray) -> np.ndarray:
         return self.grid.to_scene(positions) @ self.turn.T
@@ -92,9 +91,9 @@ class Step:
         moved, deformed = forecast(self.control, self.factor, positions, deformation, duration)
         if self.fall is not None:
             falls = np.flatnonzero(self.fall.holds(positions))
-            half_way, _ = self.fall.forecast(positions[falls], deformation[falls], 0.5 * duration)
-            falls = falls[self.fall.holds(half_way)]
-            moved[falls], deformed[falls] = self.fall.forecast(positions[falls], deformation[falls], duration)
+            falls = falls[self.fall.holds(self.fall.moved(positions[falls], 0.5 * duration))]
+            moved[falls] = self.fall.moved(positions[falls], duration)
+            deformed[falls] = self.fall.deformed(positions[falls], deformation[falls], duration)
         return moved, deformed
 
 
@@ -123,7 +122,7 @@ class Motion:
 
         A row has the jet's top, middle (2), drift (2), speed, gravity and radius, and the floor: scene units, seconds.
         """
-        rows = np.zeros((len(self.falls), COLUMNS))
+        rows = np.zeros((len(self.falls), _COLUMNS))
         turn = np.eye(3)
         for row, fall in zip(rows, self.falls):
             if fall is not None:
@@ -137,7 +136,7 @@ def falls_of(rows: np.ndarray, turn: np.ndarray, grid: Grid, times: np.ndarray) 
 
     Raises ValueError where they are no such numbers.
     """
-    if rows.shape != (max(len(times) - 1, 0), COLUMNS) or turn.shape != (3, 3):
+    if rows.shape != (max(len(times) - 1, 0), _COLUMNS) or turn.shape != (3, 3):
         raise ValueError(f"jets of shape {rows.shape} do not fit {len(times)} frames")
     falls: list[Fall | None] = []
     for row, seconds in zip(rows, np.diff(times)):

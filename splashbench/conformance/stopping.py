@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -133,8 +134,6 @@ def ignores_interrupts() -> bool:
 
 def as_pairs(overrides: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Settings as `--set` takes them: `{"a": {"b": 1}}` -> `["a.b=1"]`."""
-    import json
-
     pairs = []
     for key, value in overrides.items():
         if isinstance(value, Mapping):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from splashbench.adapter.contract import Fitted, Render
 from splashbench.adapter.messages import Failure
 from splashbench.adapter.returned import check_geometry, check_particles, checked_render
 from splashbench.conformance.messages import Held, Kind, Seen
-from splashbench.scene import Camera, TrainingScene
+from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
 
 #: Of the times between timesteps, at most so many, evenly chosen.
 _MOST_BETWEEN = 16
@@ -139,34 +140,36 @@ def _difference(whole: NDArray[np.float64], shown: NDArray[np.float64], x0: int,
 
 def held_particles(fitted: Fitted, n_frames: int) -> Held:
     """The particles' digest, or fault."""
-    try:
-        particles = fitted.particles()
-        if particles is None:
-            return Held(about="none")
+
+    def told(particles: Particles) -> Held:
         check_particles(particles, n_frames)
-    except Exception as error:
-        return Held(fault=str(error) if isinstance(error, Failure) else f"particles() raised {_named(error)}")
-    count = particles.positions.shape[1]
-    return Held(
-        digest=digest(particles.positions, particles.active, particles.velocities),
-        about=f"{count} particles at {n_frames} timesteps",
-    )
+        return Held(
+            digest=digest(particles.positions, particles.active, particles.velocities),
+            about=f"{particles.positions.shape[1]} particles at {n_frames} timesteps",
+        )
+
+    return _held(fitted, "particles", told)
 
 
 def held_geometry(fitted: Fitted, n_frames: int) -> Held:
     """The signed distance's digest, or fault."""
-    try:
-        geometry = fitted.signed_distance()
-        if geometry is None:
-            return Held(about="none")
+
+    def told(geometry: SignedDistance) -> Held:
         check_geometry(geometry, n_frames)
+        return Held(
+            digest=digest(geometry.phi, geometry.origin, geometry.voxel),
+            about="grids of " + "x".join(map(str, geometry.phi.shape[1:])),
+        )
+
+    return _held(fitted, "signed_distance", told)
+
+
+def _held(fitted: Fitted, name: str, told: Callable[[Any], Held]) -> Held:
+    """What `told` says of what the method `name` returns, and as a fault whatever either raises."""
+    try:
+        given = getattr(fitted, name)()
+        return Held(about="none") if given is None else told(given)
+    except Failure as failure:
+        return Held(fault=str(failure))
     except Exception as error:
-        return Held(fault=str(error) if isinstance(error, Failure) else f"signed_distance() raised {_named(error)}")
-    return Held(
-        digest=digest(geometry.phi, geometry.origin, geometry.voxel),
-        about="grids of " + "x".join(map(str, geometry.phi.shape[1:])),
-    )
-
-
-def _named(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"[:300]
+        return Held(fault=f"{name}() raised {type(error).__name__}: {error}"[:300])

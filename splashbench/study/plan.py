@@ -41,6 +41,7 @@ class Planned:
         method, preset, overrides: what `run_method` is given.
         reference: digest of the reference run its dpsnr_bg is measured against, None where there is none.
         timing_frames: renders timed for the frame rate; none where the study does not ask for it.
+        control: whether the method is a control.
     """
 
     scene: Named
@@ -52,6 +53,7 @@ class Planned:
     overrides: Mapping[str, Any]
     reference: str | None
     timing_frames: int
+    control: bool
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def make_plan(spec: StudySpec) -> Plan:
                         row.overrides,
                         reference.digest if reference else None,
                         timing,
+                        row.method.control,
                     )
                 )
     own = load_method(spec.method)
@@ -165,7 +168,7 @@ def _reference(spec: StudySpec, scene: Named, variant: Variant, seed: int, timin
         train_views=variant.train_views if changed else None,
     )
     digest = _digest(method, preset, resolved, seed, "cpu", scene.scene, row)
-    return Planned(scene, row, seed, digest, wanted.method, preset, overrides, None, timing)
+    return Planned(scene, row, seed, digest, wanted.method, preset, overrides, None, timing, method.control)
 
 
 def _digest(

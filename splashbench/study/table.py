@@ -72,7 +72,7 @@ class Cell:
 class Row:
     """A variant, or the reference: its runs and a cell for each metric. `paper`: what the paper reports of it.
 
-    control: the reference's row, or one of a method that is a control.
+    control: whether it is of a method that is a control, as the reference is.
     """
 
     name: str
@@ -138,7 +138,7 @@ def make_table(plan: Plan, store: Store) -> Table:
         Row(
             name,
             note,
-            name not in spec.names or any(run.result.control for run in made[name] if run.result),
+            made[name][0].planned.control,
             made[name],
             {
                 m: _cell(by_seed[name][m], None if name == spec.baseline else by_seed[spec.baseline][m])
