@@ -56,7 +56,7 @@ class DensityControl:
         self,
         optimizer: RowOptimizer,
         settings: DensitySettings,
-        changed: Callable[[dict[str, Tensor]], None] = lambda rows: None,
+        changed: Callable[[dict[str, Tensor]], None] | None = None,
     ) -> None:
         self.optimizer, self.settings, self._changed = optimizer, settings, changed
         self._forget()
@@ -119,7 +119,8 @@ class DensityControl:
         self.optimizer.set_rows("positions", (new["positions"] + shift[1])[large], halves)
         self.optimizer.set_rows("log_scales", smaller[large], halves)
         new["positions"] = new["positions"] + shift[0]
-        self._changed(new)
+        if self._changed is not None:
+            self._changed(new)
         self._replace(bright, new)
 
     def append(self, new: dict[str, Tensor]) -> None:

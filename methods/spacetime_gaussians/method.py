@@ -64,7 +64,8 @@ class SpacetimeGaussians(Method):
             extent = camera_extent(scene)
             optimizer = RowOptimizer(model, rates(config, extent, self.full), model.rows, config.iterations)
             photographs = Photographs(scene, config.longest_side, config.views_per_step, rng)
-            density = DensityControl(optimizer, config.density(extent), _new_times)
+            changed = _anywhere if config.new_times == "anywhere" else None
+            density = DensityControl(optimizer, config.density(extent), changed)
             with run.stage("fit"):
                 history = fit_dynamic(
                     model,
@@ -89,6 +90,6 @@ class SpacetimeGaussiansLite(SpacetimeGaussians):
     full: ClassVar[bool] = False
 
 
-def _new_times(rows: dict[str, Tensor]) -> None:
-    """Gaussians made from others get a time anywhere in the recording, as published."""
+def _anywhere(rows: dict[str, Tensor]) -> None:
+    """Gaussians made from others get a time anywhere in the recording."""
     rows["times"] = torch.rand_like(rows["times"])

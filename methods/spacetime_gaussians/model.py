@@ -107,10 +107,12 @@ class SpacetimeModel(DynamicModel):
 
 def rays(camera: Camera) -> np.ndarray:
     """Origin and unit direction of every pixel's ray, scene units: float32 [H, W, 6]."""
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    local = np.stack(
-        [(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones_like(u)], axis=-1
-    )
-    directions = local @ camera.w2c[:3, :3]
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    return np.concatenate([np.broadcast_to(camera.center, directions.shape), directions], axis=-1).astype(np.float32)
+    right, down, forward = camera.w2c[:3, :3]
+    u = (np.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    v = (np.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    directions = (v[:, None] * down + forward)[:, None] + u[None, :, None] * right
+    lengths = np.sqrt(np.square(v)[:, None] + np.square(u) + 1)[..., None]
+    found = np.empty((camera.height, camera.width, 6), np.float32)
+    found[..., :3] = camera.center
+    np.divide(directions, lengths, out=found[..., 3:], casting="same_kind")
+    return found

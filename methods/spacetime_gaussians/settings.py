@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from splashbench_methods.gaussian_splatting.settings import SplattingSettings
@@ -13,6 +13,7 @@ class Settings(SplattingSettings):
     """How Gaussians with a time of their own are fitted; besides what all baselines share:
 
     Attributes:
+        new_times: times of Gaussians made from others: "anywhere" in the recording, as published, or "kept".
         hull_log_width: logarithm of how long points of the hull last at the start, in recordings.
         guided_from, guided_until: shares between which Gaussians are placed where the worst view errs (guided.py),
             every `guided_every` steps; equal for never. guided_patches: patches of pixels each time.
@@ -20,7 +21,8 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 800, "hull_points": 20_000, "most": 30_000, "rate_factor": 4.0, "color_factor": 4.0,
+            "iterations": 3000, "views_per_step": 1, "hull_points": 20_000, "most": 30_000, "rate_factor": 8.0,
+            "color_factor": 4.0, "new_times": "kept",
         },
         "paper": {
             "iterations": 30_000, "views_per_step": 2, "static": "points", "static_points": 100_000,
@@ -30,6 +32,7 @@ class Settings(SplattingSettings):
         },
     }  # fmt: skip
 
+    new_times: Literal["anywhere", "kept"] = "anywhere"
     hull_log_width: float = Field(default=-3.0, ge=-10, le=3)
     guided_from: float = Field(default=0.0, ge=0, le=1)
     guided_until: float = Field(default=0.0, ge=0, le=1)

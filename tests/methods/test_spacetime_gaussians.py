@@ -20,7 +20,7 @@ from splashbench.adapter.contract import Run
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, Scene
 
-SMALL = {"iterations": 60, "static_points": 300, "hull_points": 400, "most": 1500}
+SMALL = {"iterations": 60, "views_per_step": 5, "static_points": 300, "hull_points": 400, "most": 1500}
 VARIANTS = [SpacetimeGaussians, SpacetimeGaussiansLite]
 
 
@@ -125,6 +125,16 @@ class TestFit:
         first, again = (fit(SpacetimeGaussians, balls, tmp_path, 3, iterations=8) for _ in range(2))
         for name, tensor in first.model.state_dict().items():
             assert torch.equal(tensor, again.model.state_dict()[name])
+
+    def test_times_of_gaussians_made_from_others(self, balls: Scene, tmp_path: Path) -> None:
+        growing = {"iterations": 4, "hull_points": 0, "grow_from": 0.0, "grow_until": 1.0, "grow_every": 2}
+        kept, anywhere = (
+            fit(SpacetimeGaussiansLite, balls, tmp_path, **growing, grow_gradient=1e-9, new_times=times).model.times
+            for times in ("kept", "anywhere")
+        )
+        assert min(len(kept), len(anywhere)) > 400
+        assert (kept - 0.5).abs().max() < 0.05
+        assert (anywhere - 0.5).abs().max() > 0.4
 
 
 class TestGuidedSampling:
