@@ -36,7 +36,7 @@ class Settings(MethodConfig):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 1200, "views_per_step": 2, "static_points": 8000, "hull_points": 30_000, "children": 2,
+            "iterations": 2400, "views_per_step": 1, "static_points": 8000, "hull_points": 30_000, "children": 2,
             "most": 50_000, "rate_factor": 4.0, "voxel": 0.1, "grow_from": 0.05, "grow_until": 0.35, "grow_every": 70,
         },
         "paper": {

@@ -22,7 +22,7 @@ from splashbench.render.constants import MIN_ALPHA
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, Scene
 
-SMALL = {"iterations": 60, "static_points": 300, "hull_points": 400, "most": 900}
+SMALL = {"iterations": 60, "views_per_step": 2, "static_points": 300, "hull_points": 400, "most": 900}
 TIMES = np.linspace(0, 1, 11)
 
 
