@@ -61,6 +61,8 @@ class SplashSplatConfig(MethodConfig):
     #: frames that a carrier lasts on average; None for as long as it stays in the liquid
     lifetime: PositiveInt | None = 2
     shell_depth: PositiveFloat = 1.5
+    #: how far beyond the surface carriers are born, too: coarse grids miss what is thinner than a voxel
+    shell_outside: float = Field(0, ge=0, le=0.5)
     min_per_cell: PositiveInt = 2
     max_per_cell: PositiveInt = 4
     #: no carriers where no training view can see them
@@ -70,7 +72,7 @@ class SplashSplatConfig(MethodConfig):
     children: int = Field(2, ge=1, le=6)
     base_scale: PositiveFloat = 0.35
     # Optimisation
-    iterations: int = Field(2000, ge=0)
+    iterations: int = Field(4000, ge=0)
     learning_rate_features: PositiveFloat = 0.1
     learning_rate_heads: PositiveFloat = 0.015
     learning_rate_scales: PositiveFloat = 1e-2
@@ -128,6 +130,7 @@ class SplashSplatConfig(MethodConfig):
             "control_cells": 20,
             "cell_capacity": 4,
             "max_per_cell": 2,
+            "shell_outside": 0.125,
             "iterations": 800,
             "ssim_every": 2,
             "background_preset": "quick",
@@ -168,6 +171,7 @@ class SplashSplatConfig(MethodConfig):
             lifetime=self.lifetime,
             shell=ShellSettings(
                 depth=self.shell_depth,
+                outside=self.shell_outside,
                 min_per_cell=self.min_per_cell,
                 max_per_cell=max(self.min_per_cell, self.max_per_cell),
             ),

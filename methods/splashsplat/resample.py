@@ -1,8 +1,9 @@
 """Restoring coverage from each observation (paper, "Resampling", and supplement, "Carriers").
 
-The shell -depth <= phi <= 0 is divided into cells of one transport voxel. A cell with fewer carriers than its target
-gets new ones, uniform within its part of the shell. The target grows with nearness to the silhouettes (|phi| is the
-distance to them) and with the curvature of phi.
+The shell -depth <= phi <= outside is divided into cells of one transport voxel. A cell with fewer carriers than its
+target gets new ones, uniform within its part of the shell. The target grows with nearness to the silhouettes (|phi| is
+the distance to them) and with the curvature of phi. In the paper the shell ends at phi = 0. There its Gaussians fade
+before the silhouette's edge, and drops and sheets thinner than a voxel get next to none.
 """
 
 from __future__ import annotations
@@ -21,9 +22,14 @@ _TRIES_PER_CARRIER = 6
 
 @dataclass(frozen=True)
 class ShellSettings:
-    """depth: of the shell, transport voxels. min_per_cell, max_per_cell: range of a cell's target population."""
+    """The shell and how full it is.
+
+    depth, outside: how far it reaches below and above phi = 0, transport voxels. min_per_cell, max_per_cell: range of
+    a cell's target population.
+    """
 
     depth: float = 1.5
+    outside: float = 0.0
     min_per_cell: int = 2
     max_per_cell: int = 2
     curvature_weight: float = 0.1
@@ -77,7 +83,7 @@ def newborns(
     corners = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in inner), indexing="ij"), -1)
     centres = corners.reshape(-1, 3) + np.float32(0.5)
     middle = sample(phi, centres * np.float32(ratio))
-    centres = centres[(middle > -shell.depth - _HALF_DIAGONAL) & (middle < _HALF_DIAGONAL)]
+    centres = centres[(middle > -shell.depth - _HALF_DIAGONAL) & (middle < shell.outside + _HALF_DIAGONAL)]
     if len(centres) == 0:
         return np.zeros((0, 3), dtype=np.float32)
     population = np.bincount(cell_of(positions, grid), minlength=int(np.prod(grid.shape)))
@@ -87,6 +93,6 @@ def newborns(
     tries = _TRIES_PER_CARRIER * shell.max_per_cell
     candidates = centres[:, None] + rng.random((len(centres), tries, 3), dtype=np.float32) - np.float32(0.5)
     depth = sample(phi, candidates.reshape(-1, 3) * np.float32(ratio)).reshape(len(centres), tries)
-    valid = (depth <= 0) & (depth >= -shell.depth)
+    valid = (depth <= shell.outside) & (depth >= -shell.depth)
     chosen = valid & (np.cumsum(valid, axis=1) <= missing[:, None])
     return np.ascontiguousarray(candidates[chosen])

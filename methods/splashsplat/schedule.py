@@ -15,6 +15,8 @@ import numpy as np
 
 # Of the full rates, at the end.
 LOWEST = 0.02
+# Looks at withheld photographs that are averaged.
+_LOOKS = 4
 
 
 def _cosine(done: float) -> float:
@@ -72,8 +74,8 @@ class AdaptiveSchedule:
     """Full rates until withheld photographs stop gaining, then a half cosine over a share of the iterations so far.
 
     limit: iterations at most, both parts together. every: iterations between two looks at the withheld photographs.
-    gain: by what share their loss has to fall over one look and the one before, taken together, to go on. fall: length
-    of the second part, as a share of the first.
+    gain: by what share their mean loss over four looks has to be below that of the four looks before, to go on. fall:
+    length of the second part, as a share of the first.
     """
 
     def __init__(self, limit: int, every: int, gain: float, fall: float) -> None:
@@ -91,8 +93,9 @@ class AdaptiveSchedule:
 
     def look(self, iteration: int, loss: float) -> None:
         self.losses.append(loss)
-        # Over two looks: one alone is as noisy as what it should tell.
-        if len(self.losses) > 2 and loss > (1 - self.gain) * self.losses[-3]:
+        # At full rates a look is off by some per cent either way: single ones ended fits that still gained.
+        before, now = self.losses[-2 * _LOOKS : -_LOOKS], self.losses[-_LOOKS:]
+        if len(before) == _LOOKS and sum(now) > (1 - self.gain) * sum(before):
             self._turn = min(self._turn, iteration)
 
     def factor(self, iteration: int) -> float | None:

@@ -236,5 +236,5 @@ def test_the_paper_preset_is_the_papers():
     velocity = paper.velocity
     assert (velocity.steps, velocity.step_size, velocity.band, velocity.limit) == (35, 0.45, 4.0, 8.0)
     shell = paper.carriers.shell
-    assert (shell.min_per_cell, shell.max_per_cell, shell.depth) == (2, 5, 3.0)
+    assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
     assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)

@@ -183,6 +183,23 @@ def test_newborns_fill_the_shell_and_nothing_else():
     assert (np.bincount(cell_of(np.concatenate([new, more]), GRID)) <= 2).all()
 
 
+@pytest.mark.parametrize("outside", [0.125, 0.5])
+def test_the_shell_may_reach_beyond_the_surface(outside: float):
+    shell = ShellSettings(depth=1.5, outside=outside, min_per_cell=2, max_per_cell=2)
+    empty = np.zeros((0, 3), np.float32)
+    new = newborns(ball((20, 20, 20)), GRID, 1.0, empty, shell, np.random.default_rng(0))
+    depth = np.linalg.norm(new - 20, axis=1) - 8
+    assert outside - 0.05 < depth.max() < outside + 0.1
+
+
+def test_a_drop_too_small_for_the_grid_gets_carriers_beyond_its_surface():
+    drop = ball((20, 20, 20)) + 8.05  # no node is within it
+    empty = np.zeros((0, 3), np.float32)
+    for outside, some in ((0.0, False), (0.5, True)):
+        born = newborns(drop, GRID, 1.0, empty, ShellSettings(outside=outside), np.random.default_rng(0))
+        assert (len(born) > 0) == some
+
+
 def test_crowded_cells_keep_their_oldest():
     cells, ids = np.array([7, 7, 7, 2, 7]), np.array([9, 1, 4, 3, 2])
     np.testing.assert_array_equal(within_capacity(cells, ids, 2), [False, True, False, True, True])
