@@ -2,8 +2,8 @@
 
 The shell -depth <= phi <= outside is divided into cells of one transport voxel. A cell with fewer carriers than its
 target gets new ones, uniform within its part of the shell. The target grows with nearness to the silhouettes (|phi| is
-the distance to them) and with the curvature of phi. In the paper the shell ends at phi = 0. There its Gaussians fade
-before the silhouette's edge, and drops and sheets thinner than a voxel get next to none.
+the distance to them) and with the curvature of phi. In the paper the shell ends at phi = 0; drops and sheets thinner
+than a voxel then get next to none.
 """
 
 from __future__ import annotations
