@@ -22,7 +22,7 @@ from splashbench.scene import TrainingScene
 
 def rates(settings: Settings, extent: float) -> dict[str, Rate]:
     """Learning rates by table; `extent` of the cameras, scene units."""
-    factor, network, color = settings.rate_factor, settings.network_factor, 2.5e-3 * settings.color_factor
+    factor, color = settings.rate_factor, 2.5e-3 * settings.color_factor
     position = 1.6e-4 * extent * factor
     published = {
         "positions": Rate(position, position / 100, until=0.75),
@@ -31,8 +31,16 @@ def rates(settings: Settings, extent: float) -> dict[str, Rate]:
         "opacity_logits": Rate.constant(0.05),
         "constant": Rate.constant(color),
         "rest": Rate.constant(color / 20),
-        "deformation": Rate(8e-4 * network, 1.6e-6 * network, begin=settings.warm_up),
     }
+    parts = {
+        "layers": 1.0,
+        "shift": settings.head_factor,
+        "turn": settings.head_factor,
+        "growth": settings.growth_factor,
+    }
+    for part, share in parts.items():
+        network = settings.network_factor * share
+        published[f"deformation.{part}"] = Rate(8e-4 * network, 1.6e-6 * network, begin=settings.warm_up)
     if settings.rates == "published":
         return published
     return {name: rate.short() for name, rate in published.items()}

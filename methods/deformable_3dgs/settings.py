@@ -17,14 +17,16 @@ class Settings(SplattingSettings):
         time_noise: standard deviation of the noise on a step's time at the start, in frames; it falls to 0 over
             the share `time_noise_until`.
         depth, width: of the network.
-        network_factor: times the published learning rate of the network.
+        network_factor: times the published learning rate of the network. head_factor: times that, the rate of the heads
+            for shifts and turns, growth_factor, of the head for growths; as published, 1.
         sh_degree: of the colours; one degree more every `sh_every` steps.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 1000, "views_per_step": 2, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
-            "color_factor": 4.0, "network_factor": 2.0,
+            "iterations": 2000, "views_per_step": 1, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
+            "color_factor": 4.0, "warm_up": 0.02, "depth": 4, "width": 64, "network_factor": 8.0, "head_factor": 0.03,
+            "growth_factor": 0.003,
         },
         "paper": {
             "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "depth": 8, "width": 256, "sh_degree": 3,
@@ -40,5 +42,7 @@ class Settings(SplattingSettings):
     depth: int = Field(default=8, ge=2, le=32)
     width: int = Field(default=96, ge=4, le=1024)
     network_factor: float = Field(default=1.0, gt=0, le=1000)
+    head_factor: float = Field(default=1.0, gt=0, le=1000)
+    growth_factor: float = Field(default=1.0, gt=0, le=1000)
     sh_degree: int = Field(default=1, ge=0, le=3)
     sh_every: int = Field(default=200, ge=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -44,7 +45,8 @@ class Rate:
 class RowOptimizer:
     """Updates `model` over `iterations` steps.
 
-    rates: by attribute of the model, a parameter or a module. rows: those of them that have a row per primitive.
+    rates: by attribute of the model, a parameter or a module; "part.inner" for one of a part's. rows: those of them
+    that have a row per primitive.
     """
 
     def __init__(self, model: nn.Module, rates: Mapping[str, Rate], rows: Collection[str], iterations: int) -> None:
@@ -54,7 +56,7 @@ class RowOptimizer:
         self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
 
     def _parameters(self, name: str) -> list[nn.Parameter]:
-        part = getattr(self.model, name)
+        part = operator.attrgetter(name)(self.model)
         return [part] if isinstance(part, nn.Parameter) else list(part.parameters())
 
     @property

@@ -146,11 +146,13 @@ def fit_appearance(
     tables = [RowAdam(table.requires_grad_(), rate) for table, rate in zip((features, log_scales), rates)]
     rng = np.random.default_rng([seed, 1])
     held = np.zeros(len(targets), dtype=bool)
-    if settings.withheld_share > 0:
-        held = withheld(len(targets), settings.withheld_share, np.random.default_rng([seed, 3]))
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
-    if held.any():
-        schedule = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+    if settings.withheld_share > 0:
+        adaptive = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+        if adaptive.may_stop:
+            held = withheld(len(targets), settings.withheld_share, np.random.default_rng([seed, 3]))
+        if held.any() or not adaptive.may_stop:
+            schedule = adaptive
 
     def seen(target: Target, penalised: bool) -> tuple[Tensor, Tensor, Penalties | None]:
         # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.

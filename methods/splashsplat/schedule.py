@@ -76,6 +76,8 @@ class AdaptiveSchedule:
     limit: iterations at most, both parts together. every: iterations between two looks at the withheld photographs.
     gain: by what share their mean loss over four looks has to be below that of the four looks before, to go on. fall:
     length of the second part, as a share of the first.
+
+    Where `limit` leaves no room for looks that could end the first part, there are none, and nothing is withheld.
     """
 
     def __init__(self, limit: int, every: int, gain: float, fall: float) -> None:
@@ -85,11 +87,16 @@ class AdaptiveSchedule:
         self._turned = False
 
     @property
+    def may_stop(self) -> bool:
+        """Whether looks can end the first part before the limit does."""
+        return 2 * _LOOKS * self.every < int(self.limit / (1 + self.fall))
+
+    @property
     def withholds(self) -> bool:
-        return not self._turned
+        return self.may_stop and not self._turned
 
     def due(self, iteration: int) -> bool:
-        return not self._turned and iteration > 0 and iteration % self.every == 0
+        return self.withholds and iteration > 0 and iteration % self.every == 0
 
     def look(self, iteration: int, loss: float) -> None:
         self.losses.append(loss)

@@ -20,7 +20,11 @@ from splashbench.adapter.contract import Run
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Scene
 
-SMALL = {"iterations": 60, "static_points": 300, "hull_points": 200, "most": 700, "width": 16, "depth": 4}
+# Heads as fast as published: sixty steps of slow ones move nothing far.
+SMALL = {
+    "iterations": 60, "views_per_step": 2, "static_points": 300, "hull_points": 200, "most": 700,
+    "width": 16, "depth": 4, "network_factor": 2.0, "head_factor": 1.0, "growth_factor": 1.0,
+}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -79,6 +83,15 @@ class TestNetwork:
         torch.testing.assert_close(small.factors * 100, large.factors, rtol=1e-4, atol=1e-3)
         config = Settings()
         assert rates(config, 200.0)["positions"].first == pytest.approx(100 * rates(config, 2.0)["positions"].first)
+
+
+def test_the_published_rates_are_of_one_size_in_the_network_and_quick_heads_learn_slower() -> None:
+    parts = [f"deformation.{part}" for part in ("layers", "shift", "turn", "growth")]
+    published, quick = (rates(Settings.preset(name, {}), 1.0) for name in ("paper", "quick"))
+    assert {published[part].first for part in parts} == {8e-4}
+    assert {published[part].last for part in parts} == {1.6e-6}
+    layers, shift, turn, growth = (quick[part].first for part in parts)
+    assert growth < shift == turn < layers
 
 
 def test_positions_get_no_gradient_through_the_network() -> None:
