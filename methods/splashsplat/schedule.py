@@ -85,11 +85,8 @@ class AdaptiveSchedule:
         self.losses: list[float] = []
         self._turn = int(limit / (1 + fall))
         self._turned = False
-
-    @property
-    def may_stop(self) -> bool:
-        """Whether looks can end the first part before the limit does."""
-        return 2 * _LOOKS * self.every < int(self.limit / (1 + self.fall))
+        #: whether looks can end the first part before the limit does
+        self.may_stop = 2 * _LOOKS * every < self._turn
 
     @property
     def withholds(self) -> bool:

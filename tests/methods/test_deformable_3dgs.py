@@ -20,11 +20,7 @@ from splashbench.adapter.contract import Run
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Scene
 
-# Heads as fast as published: sixty steps of slow ones move nothing far.
-SMALL = {
-    "iterations": 60, "views_per_step": 2, "static_points": 300, "hull_points": 200, "most": 700,
-    "width": 16, "depth": 4, "network_factor": 2.0, "head_factor": 1.0, "growth_factor": 1.0,
-}  # fmt: skip
+SMALL = {"iterations": 200, "static_points": 300, "hull_points": 200, "most": 700, "width": 16, "depth": 4}
 
 
 @pytest.fixture(autouse=True)
