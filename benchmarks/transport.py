@@ -39,7 +39,7 @@ import numpy as np
 from splashbench_methods.splashsplat.config import SplashSplatConfig
 from splashbench_methods.splashsplat.flip import FlipSettings, FlipSolver, gravity_in_voxels
 from splashbench_methods.splashsplat.motion import Step
-from splashbench_methods.splashsplat.reconstruct import Observations
+from splashbench_methods.splashsplat.observations import Observations
 from splashbench_methods.splashsplat.resample import newborns
 
 from splashbench.adapter import hardware

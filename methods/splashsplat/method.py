@@ -84,6 +84,7 @@ class SplashSplat(Method):
 
     id: ClassVar[str] = "splashsplat"
     title: ClassVar[str] = "SplashSplat"
+    version: ClassVar[str] = "2"
     Config = SplashSplatConfig
 
     def supports(self, scene: TrainingScene) -> Support:

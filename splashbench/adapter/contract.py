@@ -98,18 +98,21 @@ class Run:
         fit: Callable[[], T],
         save: Callable[[T, Path], None],
         load: Callable[[Path], T],
+        seeded: bool = True,
     ) -> T:
         """What `fit()` gives, or what it gave an earlier run of the same study, scene, key, seed and device.
 
         For a part of the fit that does not depend on the rest, such as a frozen background `name`. `key` has every
         setting and version the part depends on, in values that JSON has; `save` writes it into an empty folder and
         `load` reads it from there, to the same bytes in renders. The harness adds the seconds of the earlier fit.
+        seeded: whether the part depends on the seed; where not, runs of other seeds have it, too. No part may be had
+        within the fit of another: its seconds would count twice.
         """
         if self.cache is None:
             return fit()
         from splashbench.adapter.reuse import reuse
 
-        key = {**key, "seed": self.seed, "device": self.device}
+        key = {**key, "seed": self.seed if seeded else None, "device": self.device}
         part = reuse(self.cache, name, scene, key, fit, save, load)
         self._overhead_seconds += part.overhead_seconds
         if part.loaded_seconds is not None:
