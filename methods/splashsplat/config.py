@@ -73,9 +73,12 @@ class SplashSplatConfig(MethodConfig):
     base_scale: PositiveFloat = 0.35
     # Optimisation
     iterations: int = Field(4000, ge=0)
-    learning_rate_features: PositiveFloat = 0.1
+    learning_rate_features: PositiveFloat = 0.06
+    learning_rate_shared: PositiveFloat = 0.02
     learning_rate_heads: PositiveFloat = 0.015
     learning_rate_scales: PositiveFloat = 1e-2
+    #: carriers born in one cell share a part of their features: its size in voxels and in frames, for each part
+    shared_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
     anneal: bool = True
     #: of the photographs, withheld to tell when to stop before `iterations`; 0 never stops before
     withheld_share: float = Field(0.04, ge=0, le=0.1)
@@ -119,6 +122,7 @@ class SplashSplatConfig(MethodConfig):
             "learning_rate_features": 2e-3,
             "learning_rate_heads": 2e-3,
             "learning_rate_scales": 2e-3,
+            "shared_cells": (),
             "anneal": False,
             "withheld_share": 0.0,
             "prune_opacity": 0.0,
@@ -186,6 +190,8 @@ class SplashSplatConfig(MethodConfig):
         return FitSettings(
             iterations=self.iterations,
             learning_rate_features=self.learning_rate_features,
+            learning_rate_shared=self.learning_rate_shared,
+            shared_cells=self.shared_cells,
             learning_rate_heads=self.learning_rate_heads,
             learning_rate_scales=self.learning_rate_scales,
             anneal=self.anneal,

@@ -24,6 +24,7 @@ from splashbench_methods.splashsplat.decoder import (
 )
 from splashbench_methods.splashsplat.optimizer import RowAdam
 from splashbench_methods.splashsplat.schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
+from splashbench_methods.splashsplat.shared_features import SharedFeatures
 from splashbench_methods.splashsplat.subframe import Track
 from splashbench_methods.splashsplat.targets import Target
 from torch import Tensor
@@ -46,13 +47,15 @@ class FitSettings:
     iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
     anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. withheld_share: of the
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
-    `AdaptiveSchedule`.
+    `AdaptiveSchedule`. shared_cells: see `SharedFeatures`; learning_rate_shared is that of the shared parts.
     """
 
     iterations: int = 1000
     withheld_share: float = 0.0
     stop_gain: float = 0.01
-    learning_rate_features: float = 0.1
+    learning_rate_features: float = 0.06
+    learning_rate_shared: float = 0.02
+    shared_cells: tuple[float, ...] = ()
     learning_rate_heads: float = 0.015
     learning_rate_scales: float = 1e-2
     anneal: bool = True
@@ -141,9 +144,15 @@ def fit_appearance(
     decoder = appearance.decoder
     parameters = list(decoder.parameters())
     heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
-    features, log_scales = appearance.features.detach(), appearance.log_scales.detach()
-    rates = (settings.learning_rate_features, settings.learning_rate_scales)
-    tables = [RowAdam(table.requires_grad_(), rate) for table, rate in zip((features, log_scales), rates)]
+    scales = RowAdam(appearance.log_scales, settings.learning_rate_scales)
+    features = SharedFeatures(
+        appearance.features,
+        track.carriers,
+        settings.shared_cells,
+        settings.learning_rate_features,
+        settings.learning_rate_shared,
+        seed,
+    )
     rng = np.random.default_rng([seed, 1])
     held = np.zeros(len(targets), dtype=bool)
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
@@ -154,20 +163,27 @@ def fit_appearance(
         if held.any() or not adaptive.may_stop:
             schedule = adaptive
 
-    def seen(target: Target, penalised: bool) -> tuple[Tensor, Tensor, Penalties | None]:
+    def seen(
+        target: Target, frame_features: Tensor, frame_scales: Tensor, penalised: bool
+    ) -> tuple[Tensor, Tensor, Penalties | None]:
         # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
         state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
         state = replace(state, visibility=target.visibility)
         of_cells = cells[target.frame] if penalised else None
-        children, found = decoder.decode(features, log_scales, ids[target.frame], state, target.eye, of_cells)
+        rows = torch.arange(len(frame_features))
+        children, found = decoder.decode(frame_features, frame_scales, rows, state, target.eye, of_cells)
         return *composite(children, target.camera, target.background), found
+
+    def of_frame(t: int) -> tuple[Tensor, Tensor]:
+        return features.of_frame(t), appearance.log_scales.index_select(0, ids[t])
 
     @torch.no_grad()
     def loss_of_withheld() -> float:
         weights, total = settings.weights, 0.0
         for number in np.nonzero(held)[0]:
-            image, alpha, _ = seen(targets[number], penalised=False)
-            total += float(image_loss(image, alpha, targets[number], weights, weights.ssim))
+            target = targets[number]
+            image, alpha, _ = seen(target, *of_frame(target.frame), penalised=False)
+            total += float(image_loss(image, alpha, target, weights, weights.ssim))
         return total / int(held.sum())
 
     queue: list[int] = []
@@ -183,7 +199,8 @@ def fit_appearance(
             fitted = np.nonzero(~held)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
         target = targets[queue.pop()]
-        image, alpha, found = seen(target, penalised=True)
+        of_carriers, extents = (table.requires_grad_() for table in of_frame(target.frame))
+        image, alpha, found = seen(target, of_carriers, extents, penalised=True)
         assert found is not None
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
@@ -194,17 +211,18 @@ def fit_appearance(
             raise SplashbenchError(
                 f"the loss of splashsplat is {history[-1]} at iteration {iteration + 1}; lower the learning rates"
             )
-        gradients = torch.autograd.grad(loss, [features, log_scales, *parameters])
-        by_table, by_head = gradients[:2], gradients[2:]
+        gradients = torch.autograd.grad(loss, [of_carriers, extents, *parameters])
+        by_table, by_head = [gradient.coalesce().values() for gradient in gradients[:2]], gradients[2:]
         for parameter, gradient in zip(parameters, by_head):
             parameter.grad = gradient
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
-        for table, gradient in zip(tables, by_table):
-            table.step(ids[target.frame], gradient.coalesce().values(), factor)
+        features.step(target.frame, by_table[0], factor)
+        scales.step(ids[target.frame], by_table[1], factor)
         iteration += 1
         progress(schedule.done(iteration))
+    appearance.features = features.all()
     return history
 
 
