@@ -55,6 +55,21 @@ def test_another_key_seed_device_or_scene_is_another_part(balls: Scene, balls_co
     assert _part(Run(cache=cache), balls, "f", anchors=1) == "a"
 
 
+def test_a_part_that_no_seed_changes_is_shared_by_all_seeds(balls: Scene, tmp_path: Path) -> None:
+    def part(run: Run, value: str) -> str:
+        def save(text: str, directory: Path) -> None:
+            (directory / "part.txt").write_text(text)
+
+        def load(directory: Path) -> str:
+            return (directory / "part.txt").read_text()
+
+        return run.reuse("part", balls.training(), {}, lambda: value, save, load, seeded=False)
+
+    assert part(Run(cache=tmp_path, seed=0), "a") == "a"
+    assert part(Run(cache=tmp_path, seed=1), "b") == "a"
+    assert part(Run(cache=tmp_path, seed=1, device="cuda"), "c") == "c"
+
+
 def test_a_shared_background_renders_to_the_same_bytes(balls: Scene, tmp_path: Path) -> None:
     settings = BackgroundSettings(iterations=3, anchors=200, longest_side=48)
     alone = fit_background(balls.training(), settings, Run(seed=1))
