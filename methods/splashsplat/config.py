@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from splashbench_methods.scaffold_gs import BackgroundSettings
 
 
+#: Of the method; raised when a change alters figures, so that no study takes over runs, or parts of them, from before.
+VERSION = "2"
+
+
 class SplashSplatConfig(MethodConfig):
     """Settings of SplashSplat. Lengths are in transport voxels; *_cells counts cells along the longest side."""
 

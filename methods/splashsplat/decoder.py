@@ -148,21 +148,22 @@ class Decoder(nn.Module):
         self,
         features: Tensor,
         log_scales: Tensor,
-        rows: Tensor,
+        rows: Tensor | None,
         state: CarrierState,
         eye: Tensor,
         cells: ColourCells | None = None,
     ) -> tuple[Children, Penalties | None]:
-        """Children of the carriers `rows` (int64 [n], ascending) of the tables, as `forward` has them, and with `cells`
-        also the penalties on them. The gradients of the tables are sparse."""
+        """Children of the carriers `rows` (int64 [n], ascending; None for all) of the tables, as `forward` has them,
+        and with `cells` also the penalties on them. With `rows` the gradients of the tables are sparse."""
         tables = (features, log_scales)
         if all(table.device.type == "cpu" and table.dtype == torch.float32 for table in tables):
             groups = () if cells is None else (cells.of_carriers, len(cells.sizes))
             instant = Instant(state.positions, state.deformation, state.phi, eye, state.visibility, *groups)
             *children, terms = decode(self.heads(), *tables, instant, rows)
             return Children(*children), None if terms is None else Penalties(*terms.unbind())
-        active = [nn.functional.embedding(rows, table, sparse=True) for table in tables]
-        result = self(*active, state, eye)
+        if rows is not None:
+            features, log_scales = (nn.functional.embedding(rows, table, sparse=True) for table in tables)
+        result = self(features, log_scales, state, eye)
         return result, None if cells is None else penalties(result, cells)
 
     def heads(self) -> Heads:

@@ -170,8 +170,7 @@ def fit_appearance(
         state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
         state = replace(state, visibility=target.visibility)
         of_cells = cells[target.frame] if penalised else None
-        rows = torch.arange(len(frame_features))
-        children, found = decoder.decode(frame_features, frame_scales, rows, state, target.eye, of_cells)
+        children, found = decoder.decode(frame_features, frame_scales, None, state, target.eye, of_cells)
         return *composite(children, target.camera, target.background), found
 
     def of_frame(t: int) -> tuple[Tensor, Tensor]:
@@ -199,8 +198,8 @@ def fit_appearance(
             fitted = np.nonzero(~held)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
         target = targets[queue.pop()]
-        of_carriers, extents = (table.requires_grad_() for table in of_frame(target.frame))
-        image, alpha, found = seen(target, of_carriers, extents, penalised=True)
+        active = [values.requires_grad_() for values in of_frame(target.frame)]
+        image, alpha, found = seen(target, active[0], active[1], penalised=True)
         assert found is not None
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
@@ -211,15 +210,14 @@ def fit_appearance(
             raise SplashbenchError(
                 f"the loss of splashsplat is {history[-1]} at iteration {iteration + 1}; lower the learning rates"
             )
-        gradients = torch.autograd.grad(loss, [of_carriers, extents, *parameters])
-        by_table, by_head = [gradient.coalesce().values() for gradient in gradients[:2]], gradients[2:]
+        by_feature, by_scale, *by_head = torch.autograd.grad(loss, [*active, *parameters])
         for parameter, gradient in zip(parameters, by_head):
             parameter.grad = gradient
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
-        features.step(target.frame, by_table[0], factor)
-        scales.step(ids[target.frame], by_table[1], factor)
+        features.step(target.frame, by_feature, factor)
+        scales.step(ids[target.frame], by_scale, factor)
         iteration += 1
         progress(schedule.done(iteration))
     appearance.features = features.all()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
-from splashbench_methods.splashsplat.config import SplashSplatConfig
+from splashbench_methods.splashsplat.config import VERSION, SplashSplatConfig
 from splashbench_methods.splashsplat.fit import composite
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.occlusion import Occlusion
@@ -84,7 +84,7 @@ class SplashSplat(Method):
 
     id: ClassVar[str] = "splashsplat"
     title: ClassVar[str] = "SplashSplat"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = VERSION
     Config = SplashSplatConfig
 
     def supports(self, scene: TrainingScene) -> Support:

@@ -1,11 +1,10 @@
 """What the masks say of the liquid, frame by frame: phi_t, and the motion between frames (paper, "Observation fields").
 
-The runs of one study share them: they are most of a short fit, and its rows seldom differ in them (`Run.reuse`).
+The runs of one study share them (`Run.reuse`): they are most of a short fit, and its rows seldom differ in them.
 """
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from splashbench_methods.splashsplat.config import SplashSplatConfig
+from splashbench_methods.splashsplat.config import VERSION, SplashSplatConfig
 from splashbench_methods.splashsplat.gate import gated
 from splashbench_methods.splashsplat.model import pack_phi
 from splashbench_methods.splashsplat.motion import Fall, Motion
@@ -36,11 +35,11 @@ Report = Callable[[float, str], None]
 
 # A carrier is seen through at most this many shells of liquid.
 SEEN_THROUGH = 1.5
-#: Of everything here; raised when a change alters what it gives, so that no study takes over what was before.
-VERSION = 1
 # The settings that phi_t depends on.
 _PHI = ("hull_cells", "distance", "container", "detect_failures", "camera_times", "pool", "ballistic")
 _FILE = "phi.float16"
+# Parts of the progress where a study keeps them.
+_DISTANCES_DONE, _VELOCITIES_DONE = 0.5, 0.9
 
 
 class Observations:
@@ -52,7 +51,7 @@ class Observations:
 
     def __init__(self, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report) -> None:
         self._scene, self._config, self._run, self._report = scene, config, run, report
-        self._key: dict[str, Any] = {"version": VERSION, **config.model_dump(mode="json", include=set(_PHI))}
+        self._key: dict[str, Any] = {"method": VERSION, **config.model_dump(mode="json", include=set(_PHI))}
         self._times = scene.times
         self.n_frames = scene.n_frames
         report(0.0, "reading masks")
@@ -95,9 +94,10 @@ class Observations:
         with self._stored() as stream:
             if self._moves:
                 self.motion.velocities[:] = self._shared_velocities(stream)
-            yield from self._followed(self._read(stream), False)
+            yield from self._followed(self._read(stream), fit_motion=False, start=_VELOCITIES_DONE)
 
-    def _followed(self, frames: Iterator[np.ndarray], fit_motion: bool) -> Iterator[np.ndarray]:
+    def _followed(self, frames: Iterator[np.ndarray], fit_motion: bool, start: float = 0.0) -> Iterator[np.ndarray]:
+        """phi_t of `frames`, with what follows from it. start: the part of the progress that lies behind."""
         before: np.ndarray | None = None
         for t, phi in enumerate(frames):
             with self._run.stage("signed distance"):
@@ -108,7 +108,8 @@ class Observations:
             before = now
             with self._run.stage("carriers"):  # what is done with phi until the next is asked for
                 yield phi
-            self._report((t + 1) / self.n_frames, "signed distance, velocity, carriers")
+            what = "signed distance, velocity, carriers" if fit_motion else "carriers"
+            self._report(start + (1 - start) * (t + 1) / self.n_frames, what)
 
     @property
     def _moves(self) -> bool:
@@ -149,8 +150,8 @@ class Observations:
         return bounds
 
     def _frames(self) -> Iterator[np.ndarray]:
-        """phi_t on `hull_grid`, in its voxels. At half precision, a thousandth of a voxel near the surface, so that
-        keeping them for other runs takes half the room and changes nothing."""
+        """phi_t on `hull_grid`, in its voxels. At half precision, which is a thousandth of a voxel near the surface, in
+        every run: what is kept for other runs takes half the room, and is what they would compute."""
         method = self._config.distance
         frames = signed_distance_frames(self.silhouettes, self.hull_grid, method, self._container)
         for t in range(self.n_frames):
@@ -165,15 +166,20 @@ class Observations:
         """`_frames` one after another in a file that the study keeps, float16."""
 
         def write() -> IO[bytes]:
-            stream = tempfile.TemporaryFile(dir=self._run.cache)  # noqa: SIM115
-            for phi in self._frames():
-                stream.write(phi.tobytes())
+            stream = tempfile.NamedTemporaryFile(dir=self._run.cache, prefix="phi-", delete=False)  # noqa: SIM115
+            try:
+                for t, phi in enumerate(self._frames()):
+                    stream.write(phi.tobytes())
+                    self._report(_DISTANCES_DONE * (t + 1) / self.n_frames, "signed distance")
+            except BaseException:
+                stream.close()
+                Path(stream.name).unlink()
+                raise
             return stream
 
         def save(stream: IO[bytes], directory: Path) -> None:
-            stream.seek(0)
-            with (directory / _FILE).open("wb") as copy:
-                shutil.copyfileobj(stream, copy, 1 << 20)
+            stream.flush()
+            Path(stream.name).rename(directory / _FILE)  # and stays open
 
         def load(directory: Path) -> IO[bytes]:
             return (directory / _FILE).open("rb")
@@ -205,7 +211,8 @@ class Observations:
                 if before is not None:
                     velocities[t - 1] = self._fitted(before, now)
                 before = now
-                self._report((t + 1) / self.n_frames, "velocity")
+                done = (t + 1) / self.n_frames
+                self._report(_DISTANCES_DONE + (_VELOCITIES_DONE - _DISTANCES_DONE) * done, "velocity")
             return velocities
 
         key = {

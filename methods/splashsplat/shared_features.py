@@ -44,10 +44,11 @@ class SharedFeatures:
         frames = range(carriers.n_frames)
         self._ids = [torch.from_numpy(carriers.ids[carriers.rows(t)].astype(np.int64)) for t in frames]
         self._levels: list[_Level] = []
+        born = births(carriers)
         # Cells of different sizes have their faces at different places.
         rng = np.random.default_rng([seed, 4])
         for size in sizes:
-            cells = torch.from_numpy(cells_of_birth(carriers, size, rng.random(4)))
+            cells = torch.from_numpy(cells_of(born, size, rng.random(4)))
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
             found = [torch.unique(cells.index_select(0, ids), return_inverse=True) for ids in self._ids]
             rows, members = [rows for rows, _ in found], [members for _, members in found]
@@ -76,18 +77,23 @@ class SharedFeatures:
         return features
 
 
-def cells_of_birth(carriers: Carriers, size: float, shift: np.ndarray) -> np.ndarray:
-    """The cell that each carrier was born in, int64 [count] numbered from 0 without gaps.
+def births(carriers: Carriers) -> np.ndarray:
+    """Where (transport-grid coordinates) and when (frames) each carrier was born, float64 [count, 4]."""
+    first, _ = carriers.births_and_ends()
+    born = np.zeros((carriers.count, 4))
+    born[:, 3] = first
+    for t in range(carriers.n_frames):
+        rows = carriers.rows(t)
+        new = first[carriers.ids[rows]] == t
+        born[carriers.ids[rows][new], :3] = carriers.positions[rows][new]
+    return born
+
+
+def cells_of(born: np.ndarray, size: float, shift: np.ndarray) -> np.ndarray:
+    """The cell of each of `born` [count, 4] (see `births`), int64 [count] numbered from 0 without gaps.
 
     size: of a cell, in transport voxels and in frames. shift: [4] where its faces are along x, y, z and time, in cells.
     """
-    births, _ = carriers.births_and_ends()
-    born = np.zeros((carriers.count, 4))
-    born[:, 3] = births
-    for t in range(carriers.n_frames):
-        rows = carriers.rows(t)
-        new = births[carriers.ids[rows]] == t
-        born[carriers.ids[rows][new], :3] = carriers.positions[rows][new]
     keys = np.floor(born / size + shift).astype(np.int64)
     _, cells = np.unique(keys, axis=0, return_inverse=True)
     return cells.reshape(-1)

@@ -68,6 +68,7 @@ class Run:
     reused: dict[str, float] = field(default_factory=dict)
     stages: dict[str, float] = field(default_factory=dict)
     _overhead_seconds: float = 0.0
+    _digests: dict[Path, str] = field(default_factory=dict)
     _report: Callable[[float, str], None] | None = None
     _checkpoint: Callable[[Fitted], None] | None = None
 
@@ -106,14 +107,18 @@ class Run:
         setting and version the part depends on, in values that JSON has; `save` writes it into an empty folder and
         `load` reads it from there, to the same bytes in renders. The harness adds the seconds of the earlier fit.
         seeded: whether the part depends on the seed; where not, runs of other seeds have it, too. No part may be had
-        within the fit of another: its seconds would count twice.
+        within the fit of another: the seconds would be wrong.
         """
         if self.cache is None:
             return fit()
-        from splashbench.adapter.reuse import reuse
+        from splashbench.adapter.reuse import reuse, training_digest
 
+        if scene.directory not in self._digests:
+            start = time.perf_counter()
+            self._digests[scene.directory] = training_digest(scene)
+            self._overhead_seconds += time.perf_counter() - start
         key = {**key, "seed": self.seed if seeded else None, "device": self.device}
-        part = reuse(self.cache, name, scene, key, fit, save, load)
+        part = reuse(self.cache, name, self._digests[scene.directory], key, fit, save, load)
         self._overhead_seconds += part.overhead_seconds
         if part.loaded_seconds is not None:
             self.reused[name] = part.loaded_seconds

@@ -55,7 +55,7 @@ class Part(Generic[T]):
 def reuse(
     cache: Path,
     name: str,
-    scene: TrainingScene,
+    scene: str,
     key: Mapping[str, Any],
     fit: Callable[[], T],
     save: Callable[[T, Path], None],
@@ -63,11 +63,11 @@ def reuse(
 ) -> Part[T]:
     """The part `name` from the folder `cache`, fitted and kept there where it is not yet.
 
-    key: what it depends on besides the scene, in values that JSON has. save and load: as in `Fitted.save` and
-    `Method.load`, from a folder of its own. Of runs at the same time one fits and the others wait.
+    scene: its `training_digest`. key: what the part depends on besides it, in values that JSON has. save and load: as
+    in `Fitted.save` and `Method.load`, from a folder of its own. Of runs at the same time one fits and the others wait.
     """
     start = time.perf_counter()
-    whole = {"splashbench": __version__, "scene": training_digest(scene), **key}
+    whole = {"splashbench": __version__, "scene": scene, **key}
     digest = hashlib.sha256(json.dumps([name, whole], sort_keys=True).encode()).hexdigest()[:16]
     place = Path(cache, f"{name}-{digest}")
     with alone(place.with_suffix(".lock")):

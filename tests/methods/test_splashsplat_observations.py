@@ -1,4 +1,4 @@
-"""Observation fields shared by the runs of a study: the same to the last bit, and their time counted once each."""
+"""Observation fields shared by the runs of a study: the same to the last bit, by what they depend on."""
 
 from pathlib import Path
 
@@ -33,8 +33,6 @@ def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path
     first, second = runs
     assert first.reused == {}
     assert list(second.reused) == ["bounds", "distances", "velocities"]
-    # What the second run did not do, the first one's clock has.
-    assert second.fit_seconds(0.0) == pytest.approx(sum(second.reused.values()))
     assert "velocity" in first.stages
     assert "velocity" not in second.stages
     assert "failed masks" not in second.stages
@@ -51,6 +49,10 @@ def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path
         ({"hull_cells": 36}, []),
         ({"distance": "carve"}, []),
         ({"detect_failures": False}, []),
+        ({"container": False}, []),
+        ({"camera_times": False}, []),
+        ({"pool": False}, []),
+        ({"ballistic": False}, []),
     ],
 )
 def test_another_run_takes_over_what_its_settings_leave_as_it_was(
@@ -58,9 +60,10 @@ def test_another_run_takes_over_what_its_settings_leave_as_it_was(
 ) -> None:
     _observed(balls, Run(cache=tmp_path))
     run = Run(cache=tmp_path)
-    _, shared = _observed(balls, run, **settings)
+    shared_phi, shared = _observed(balls, run, **settings)
     assert list(run.reused) == taken_over
-    _, alone = _observed(balls, Run(), **settings)
+    phi, alone = _observed(balls, Run(), **settings)
+    np.testing.assert_array_equal(shared_phi, phi)
     np.testing.assert_array_equal(shared.packed, alone.packed)
     np.testing.assert_array_equal(shared.motion.velocities, alone.motion.velocities)
 
@@ -76,3 +79,23 @@ def test_masks_that_failed_stay_distrusted(balls: Scene, tmp_path: Path, monkeyp
     assert list(run.reused) == ["bounds", "distances", "velocities"]
     np.testing.assert_array_equal(first.silhouettes.failed_masks, distrusted)
     np.testing.assert_array_equal(second.silhouettes.failed_masks, distrusted)
+
+
+def test_a_run_that_fails_leaves_no_file_behind(balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def frames(*_: object) -> None:
+        raise RuntimeError("in the middle")
+
+    monkeypatch.setattr(observations, "signed_distance_frames", frames)
+    with pytest.raises(RuntimeError, match="in the middle"):
+        _observed(balls, Run(cache=tmp_path), pool=False, ballistic=False)
+    assert not list(tmp_path.glob("phi-*"))
+
+
+def test_progress_never_goes_back(balls: Scene, tmp_path: Path) -> None:
+    for run in (Run(cache=tmp_path), Run(cache=tmp_path), Run()):
+        told: list[float] = []
+        config = SplashSplatConfig.model_validate(SMALL)
+        for _ in Observations(balls.training(), config, run, lambda done, message, told=told: told.append(done)):
+            pass
+        assert told == sorted(told)
+        assert told[-1] == 1

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 from splashbench_methods.splashsplat.carriers import Carriers
+from splashbench_methods.splashsplat.config import SplashSplatConfig
 from splashbench_methods.splashsplat.optimizer import RowAdam
-from splashbench_methods.splashsplat.shared_features import SharedFeatures, cells_of_birth
+from splashbench_methods.splashsplat.shared_features import SharedFeatures, births, cells_of
 
 RATES = {"own_rate": 0.06, "shared_rate": 0.02}
 
@@ -25,7 +26,7 @@ def _features(*sizes: float, seed: int = 0) -> tuple[SharedFeatures, torch.Tenso
 
 
 def test_a_cell_is_of_space_and_time_and_of_the_birth_alone() -> None:
-    near, late = cells_of_birth(_carriers(), 4.0, np.zeros(4)), cells_of_birth(_carriers(), 2.0, np.zeros(4))
+    near, late = cells_of(births(_carriers()), 4.0, np.zeros(4)), cells_of(births(_carriers()), 2.0, np.zeros(4))
     # Carrier 1 moved eight voxels on, 2 ended where 0 began: neither matters.
     assert near[0] == near[1] == near[3]
     assert near[2] != near[0]
@@ -34,7 +35,7 @@ def test_a_cell_is_of_space_and_time_and_of_the_birth_alone() -> None:
 
 
 def test_faces_are_where_the_shift_says() -> None:
-    cells = cells_of_birth(_carriers(), 4.0, np.array([0.6, 0.0, 0.0, 0.0]))  # faces at 1.6, 5.6, ... along x
+    cells = cells_of(births(_carriers()), 4.0, np.array([0.6, 0.0, 0.0, 0.0]))  # faces at 1.6, 5.6, ... along x
     assert cells[0] != cells[1]
     assert cells[0] == cells[3]
 
@@ -92,3 +93,13 @@ def test_the_same_seed_has_the_same_cells_and_another_one_others() -> None:
         totals.append(features.all())
     assert torch.equal(totals[0], totals[1])
     assert any(not torch.equal(totals[0], other) for other in totals[2:])
+
+
+def test_settings_reach_the_fit() -> None:
+    presets = {name: SplashSplatConfig.model_validate(values) for name, values in SplashSplatConfig.presets.items()}
+    assert {name: config.optimisation.shared_cells for name, config in presets.items()} == {
+        "best": (4.0, 16.0),
+        "paper": (),
+        "quick": (4.0, 16.0),
+    }
+    assert SplashSplatConfig(learning_rate_shared=0.007).optimisation.learning_rate_shared == 0.007
