@@ -239,6 +239,6 @@ class Observations:
     def _fall(self, t: int) -> Fall | None:
         """The jet's, from frame `t` to the next."""
         found = self._survey
-        if found is None or (jet := found.jets[t]) is None or self._config.variant == "per_frame":
+        if found is None or (jet := found.jets[t]) is None or not self._moves:
             return None
         return Fall(jet, found.jet_floor(t), found.turn, self.grid, float(self._times[t + 1] - self._times[t]))
