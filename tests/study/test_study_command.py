@@ -264,6 +264,12 @@ def test_an_unknown_study_is_told_with_those_there_are() -> None:
         load_spec("ablations")
 
 
+def test_help_names_every_study_that_is_shipped(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["study", "ablate", "--help"])
+    assert f"one of: {', '.join(shipped())}" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -> None:
     spec = _spec(
         balls_directory,
@@ -285,11 +291,8 @@ def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -
     assert "**" not in table.split("| Variant |")[1]  # no best row, with one that is no control
 
 
-@pytest.mark.parametrize(
-    "name", ["ablation", "masks", "views", "sensitivity", "best", "presets", "baselines", "interpolation"]
-)
+@pytest.mark.parametrize("name", shipped())
 def test_the_shipped_studies_fit_the_method(name: str, balls_directory: Path) -> None:
-    assert name in shipped()
     plan = make_plan(load_spec(name, scenes=[str(balls_directory)]))
     assert len(plan.runs) == 3 * len(plan.spec.variants)
     assert len(plan.reference_row) == 3
