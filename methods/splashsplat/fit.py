@@ -148,6 +148,7 @@ def fit_appearance(
     features = SharedFeatures(
         appearance.features,
         track.carriers,
+        ids,
         settings.shared_cells,
         settings.learning_rate_features,
         settings.learning_rate_shared,

@@ -5,6 +5,7 @@ The runs of one study share them (`Run.reuse`): they are most of a short fit, an
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -38,6 +39,7 @@ SEEN_THROUGH = 1.5
 # The settings that phi_t depends on.
 _PHI = ("hull_cells", "distance", "container", "detect_failures", "camera_times", "pool", "ballistic")
 _FILE = "phi.float16"
+_COPIED_AT_ONCE = 1 << 22
 # Parts of the progress where a study keeps them.
 _DISTANCES_DONE, _VELOCITIES_DONE = 0.5, 0.9
 
@@ -166,20 +168,21 @@ class Observations:
         """`_frames` one after another in a file that the study keeps, float16."""
 
         def write() -> IO[bytes]:
-            stream = tempfile.NamedTemporaryFile(dir=self._run.cache, prefix="phi-", delete=False)  # noqa: SIM115
+            # Nameless: of a run that is killed nothing stays behind.
+            stream = tempfile.TemporaryFile(dir=self._run.cache)  # noqa: SIM115
             try:
                 for t, phi in enumerate(self._frames()):
                     stream.write(phi.tobytes())
                     self._report(_DISTANCES_DONE * (t + 1) / self.n_frames, "signed distance")
             except BaseException:
                 stream.close()
-                Path(stream.name).unlink()
                 raise
             return stream
 
         def save(stream: IO[bytes], directory: Path) -> None:
-            stream.flush()
-            Path(stream.name).rename(directory / _FILE)  # and stays open
+            stream.seek(0)
+            with (directory / _FILE).open("wb") as kept:
+                shutil.copyfileobj(stream, kept, _COPIED_AT_ONCE)
 
         def load(directory: Path) -> IO[bytes]:
             return (directory / _FILE).open("rb")

@@ -33,17 +33,26 @@ class _Level:
 class SharedFeatures:
     """The features of `carriers` as sums; see above.
 
-    own: float32 [count, width], the carriers' own parts at first; updated in place. sizes: of the cells, in transport
-    voxels and, by the same number, in frames; none where nothing is shared. own_rate, shared_rate: of learning.
+    own: float32 [count, width], the carriers' own parts at first; updated in place. ids: int64 [n] of each frame, its
+    carriers' rows there. sizes: of the cells, in transport voxels and, by the same number, in frames; none where
+    nothing is shared. own_rate, shared_rate: of learning.
     """
 
     def __init__(
-        self, own: Tensor, carriers: Carriers, sizes: Sequence[float], own_rate: float, shared_rate: float, seed: int
+        self,
+        own: Tensor,
+        carriers: Carriers,
+        ids: list[Tensor],
+        sizes: Sequence[float],
+        own_rate: float,
+        shared_rate: float,
+        seed: int,
     ) -> None:
         self._own, self._adam = own, RowAdam(own, own_rate)
-        frames = range(carriers.n_frames)
-        self._ids = [torch.from_numpy(carriers.ids[carriers.rows(t)].astype(np.int64)) for t in frames]
+        self._ids = ids
         self._levels: list[_Level] = []
+        if not sizes:
+            return
         born = births(carriers)
         # Cells of different sizes have their faces at different places.
         rng = np.random.default_rng([seed, 4])

@@ -55,7 +55,7 @@ class Part(Generic[T]):
 def reuse(
     cache: Path,
     name: str,
-    scene: str,
+    scene_digest: str,
     key: Mapping[str, Any],
     fit: Callable[[], T],
     save: Callable[[T, Path], None],
@@ -63,11 +63,12 @@ def reuse(
 ) -> Part[T]:
     """The part `name` from the folder `cache`, fitted and kept there where it is not yet.
 
-    scene: its `training_digest`. key: what the part depends on besides it, in values that JSON has. save and load: as
-    in `Fitted.save` and `Method.load`, from a folder of its own. Of runs at the same time one fits and the others wait.
+    scene_digest: see `training_digest`. key: what the part depends on besides the scene, in values that JSON has. save
+    and load: as in `Fitted.save` and `Method.load`, from a folder of its own. Of runs at the same time one fits and the
+    others wait.
     """
     start = time.perf_counter()
-    whole = {"splashbench": __version__, "scene": scene, **key}
+    whole = {"splashbench": __version__, "scene": scene_digest, **key}
     digest = hashlib.sha256(json.dumps([name, whole], sort_keys=True).encode()).hexdigest()[:16]
     place = Path(cache, f"{name}-{digest}")
     with alone(place.with_suffix(".lock")):

@@ -1,6 +1,8 @@
 """Observation fields shared by the runs of a study: the same to the last bit, by what they depend on."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,14 +83,23 @@ def test_masks_that_failed_stay_distrusted(balls: Scene, tmp_path: Path, monkeyp
     np.testing.assert_array_equal(second.silhouettes.failed_masks, distrusted)
 
 
-def test_a_run_that_fails_leaves_no_file_behind(balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def frames(*_: object) -> None:
+def test_a_run_that_ends_in_the_middle_leaves_no_file_behind(
+    balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there: list[str] = []
+    real = observations.signed_distance_frames
+
+    def frames(*arguments: Any) -> Iterator[np.ndarray]:
+        yield next(real(*arguments))
+        # Were the process killed now, this is what would stay.
+        there.extend(path.name for path in tmp_path.iterdir() if path.is_file() and path.suffix != ".lock")
         raise RuntimeError("in the middle")
 
     monkeypatch.setattr(observations, "signed_distance_frames", frames)
     with pytest.raises(RuntimeError, match="in the middle"):
         _observed(balls, Run(cache=tmp_path), pool=False, ballistic=False)
-    assert not list(tmp_path.glob("phi-*"))
+    assert not there
+    assert [path.name[:6] for path in sorted(tmp_path.iterdir()) if path.suffix != ".lock"] == ["bounds"]
 
 
 def test_progress_never_goes_back(balls: Scene, tmp_path: Path) -> None:

@@ -22,7 +22,12 @@ def _carriers() -> Carriers:
 
 def _features(*sizes: float, seed: int = 0) -> tuple[SharedFeatures, torch.Tensor]:
     own = torch.arange(8, dtype=torch.float32).reshape(4, 2)
-    return SharedFeatures(own, _carriers(), sizes, **RATES, seed=seed), own
+    return _shared(own, _carriers(), sizes, seed), own
+
+
+def _shared(own: torch.Tensor, carriers: Carriers, sizes: tuple[float, ...], seed: int = 0) -> SharedFeatures:
+    ids = [torch.from_numpy(carriers.ids[carriers.rows(t)].astype(np.int64)) for t in range(carriers.n_frames)]
+    return SharedFeatures(own, carriers, ids, sizes, **RATES, seed=seed)
 
 
 def test_a_cell_is_of_space_and_time_and_of_the_birth_alone() -> None:
@@ -77,7 +82,7 @@ def test_no_carriers_at_all(sizes: tuple[float, ...]) -> None:
     empty = np.zeros(0, np.int32)
     none = np.zeros((0, 3), np.float32)
     carriers = Carriers(np.zeros(3, int), empty, none, np.zeros((0, 3, 3), np.float32), np.zeros(0, np.float32), 0)
-    features = SharedFeatures(torch.zeros(0, 2), carriers, sizes, **RATES, seed=0)
+    features = _shared(torch.zeros(0, 2), carriers, sizes)
     assert features.all().shape == (0, 2)
     assert features.of_frame(1).shape == (0, 2)
     features.step(0, torch.zeros(0, 2), 1.0)
