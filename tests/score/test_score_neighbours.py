@@ -1,0 +1,71 @@
+"""Sums over nearest neighbours against those of a k-d tree: points spread evenly, in clumps, afar and on one spot."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from splashbench.score import neighbours
+from splashbench.score.neighbours import nearest_poly6_sums
+
+RADIUS = 0.3
+
+
+def _by_tree(points: np.ndarray, count: int, radius: float) -> np.ndarray:
+    count = min(count, len(points) - 1)
+    distances, _ = cKDTree(points).query(points, count + 1)
+    inner = radius**2 - np.square(np.minimum(distances[:, 1:], radius))
+    return (inner**3).sum(axis=1)
+
+
+def _points(kind: str) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    volume = rng.random((3000, 3)) * [3, 1, 1]
+    if kind == "volume":
+        return volume
+    if kind == "sheet":
+        return volume * [1, 1, 0.01]
+    if kind == "line":
+        return volume * [1, 0, 0]
+    if kind == "clump and spray":
+        return np.concatenate([0.02 * volume, 3 * volume[:1500]])
+    if kind == "stray":
+        return np.concatenate([volume[:500], 1e9 * rng.normal(size=(50, 3)), [[1e300, 0, 0], [-1e300, 0, 0]]])
+    if kind == "one spot":
+        return np.concatenate([np.ones((400, 3)), volume[:100]])
+    if kind == "sparse":
+        return 100 * volume[:200]
+    raise AssertionError(kind)
+
+
+@pytest.mark.parametrize("count", [1, 8, 64])
+@pytest.mark.parametrize("kind", ["volume", "sheet", "line", "clump and spray", "stray", "one spot", "sparse"])
+def test_sums_are_those_of_a_tree(kind: str, count: int) -> None:
+    points = _points(kind)
+    near = np.abs(points).max(axis=1) < 1e6  # the others are nobody's neighbours
+    found = nearest_poly6_sums(points, count, RADIUS)
+    np.testing.assert_allclose(found[near], _by_tree(points[near], count, RADIUS), rtol=1e-12)
+    assert not found[~near].any()
+
+
+@pytest.mark.parametrize("share", [0.001, 0.02, 0.1, 5.0, 100.0])
+def test_the_size_of_cells_does_not_matter(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = _points("volume")
+    monkeypatch.setattr(neighbours, "_PER_NEIGHBOUR", share)
+    np.testing.assert_allclose(nearest_poly6_sums(points, 64, RADIUS), _by_tree(points, 64, RADIUS), rtol=1e-12)
+
+
+def test_fewer_points_than_neighbours_and_none() -> None:
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
+    near, far = (RADIUS**2 - 0.01) ** 3, (RADIUS**2 - 0.04) ** 3
+    np.testing.assert_allclose(nearest_poly6_sums(points, 64, RADIUS), [near + far, 2 * near, near + far])
+    assert nearest_poly6_sums(np.zeros((0, 3)), 64, RADIUS).shape == (0,)
+    assert nearest_poly6_sums(np.zeros((1, 3)), 64, RADIUS).tolist() == [0.0]
+
+
+def test_the_same_sums_in_any_order_and_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = _points("clump and spray")
+    sums = nearest_poly6_sums(points, 16, RADIUS)
+    order = np.random.default_rng(4).permutation(len(points))
+    np.testing.assert_allclose(nearest_poly6_sums(points[order], 16, RADIUS), sums[order], rtol=1e-13)
+    monkeypatch.setattr("splashbench.parallel.thread_count", lambda: 1)
+    np.testing.assert_array_equal(nearest_poly6_sums(points, 16, RADIUS), sums)
