@@ -137,25 +137,35 @@ class DivergenceFree:
     """Projection of fields [nx, ny, nz, 3] onto divergence-free ones, by Fourier transform with zero padding.
 
     The symbol is that of the central difference, so it is this discrete divergence that vanishes. Padding to twice
-    the size keeps opposite faces from seeing each other.
+    the size keeps opposite faces from seeing each other. The padding is a multiple of the field; axis by axis, most of
+    it need not be transformed.
     """
 
     def __init__(self, shape: tuple[int, int, int]) -> None:
         self.shape = shape
         self.padded = tuple(fft.next_fast_len(2 * n, real=True) for n in shape)
-        full = [np.sin(2 * np.pi * np.fft.fftfreq(n)) for n in self.padded[:2]]
-        half = np.sin(2 * np.pi * np.fft.rfftfreq(self.padded[2]))
-        self.symbol = np.stack(np.meshgrid(*full, half, indexing="ij"), axis=-1).astype(np.float32)
-        square = (self.symbol**2).sum(axis=-1, keepdims=True)
+        px, py, pz = self.padded
+        waves = (np.fft.fftfreq(px)[:, None, None], np.fft.fftfreq(py)[:, None], np.fft.rfftfreq(pz))
+        self.symbol = [np.sin(2 * np.pi * wave).astype(np.float32) for wave in waves]
+        square = np.square(self.symbol[0]) + np.square(self.symbol[1]) + np.square(self.symbol[2])
         self.inverse = np.where(square > 1e-9, 1 / np.maximum(square, 1e-9), 0).astype(np.float32)
 
     def __call__(self, field: np.ndarray) -> np.ndarray:
         """The divergence-free part of `field`, float32 [nx, ny, nz, 3]."""
-        spectrum = fft.rfftn(field.astype(np.float32), s=self.padded, axes=(0, 1, 2))
-        along = (self.symbol * spectrum).sum(axis=-1, keepdims=True) * self.inverse
-        spectrum -= self.symbol * along
-        nx, ny, nz = self.shape
-        return fft.irfftn(spectrum, s=self.padded, axes=(0, 1, 2))[:nx, :ny, :nz]
+        (nx, ny, _), (px, py, pz) = self.shape, self.padded
+        spectrum = fft.rfft(np.ascontiguousarray(np.moveaxis(field, -1, 0), np.float32), pz, axis=3)
+        spectrum = fft.fft(spectrum, px, axis=1)
+        spectrum = fft.fft(spectrum, py, axis=2)
+        along = self.symbol[0] * spectrum[0]
+        along += self.symbol[1] * spectrum[1]
+        along += self.symbol[2] * spectrum[2]
+        along *= self.inverse
+        for symbol, component in zip(self.symbol, spectrum):
+            component -= symbol * along
+        spectrum = fft.ifft(spectrum, axis=1, norm="forward")[:, :nx]
+        spectrum = fft.ifft(spectrum, axis=2, norm="forward")[:, :, :ny]
+        free = fft.irfft(spectrum, pz, axis=3, norm="forward")[..., : self.shape[2]]
+        return np.moveaxis(free * np.float32(1 / (px * py * pz)), 0, -1)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from splashbench.files import read_model, write_model
 from splashbench.processes import end_with_parent, terminable
 from splashbench.scene import Scene
 from splashbench.score import Result, score_submission, shared_fields
-from splashbench.score.uniformity import DistanceFields
 from splashbench.study.scenes import changed_scene
 from splashbench.study.spec import Variant
 from splashbench.submission import Record, Status, Submission
@@ -156,7 +154,7 @@ def _scored(job: Job, store: Store, entry: Entry) -> Entry:
         reference = store.reference(job.reference) if job.reference else None
     weights = Path(job.lpips_weights) if job.lpips_weights else None
     # The ruler is the scene as it is: worse masks or fewer views must not move what runs are measured by.
-    result = score_submission(scene, submission, reference, weights, fields=_fields(original))
+    result = score_submission(scene, submission, reference, weights, fields=shared_fields(original))
     saved = result.save(store.results)
     if not job.keep and not job.is_reference:
         shutil.rmtree(place)
@@ -169,17 +167,6 @@ def _scored(job: Job, store: Store, entry: Entry) -> Entry:
             "train_views": list(scene.train),
         }
     )
-
-
-_FIELDS: dict[str, Callable[[], DistanceFields]] = {}
-
-
-def _fields(scene: Scene) -> Callable[[], DistanceFields]:
-    """The scene's distance fields; those of the last scene stay in memory, as its variants come one after another."""
-    if scene.digest not in _FIELDS:
-        _FIELDS.clear()
-        _FIELDS[scene.digest] = shared_fields(scene)
-    return _FIELDS[scene.digest]
 
 
 def main(parent: str, file: str) -> int:

@@ -90,6 +90,19 @@ def test_projection_leaves_a_divergence_free_field_alone_and_removes_a_gradient(
     assert np.abs(central_divergence(mixed)).max() < 1e-3 * np.abs(central_divergence(slopes)).max()
 
 
+def test_the_projection_axis_by_axis_is_that_of_the_whole_padded_volume():
+    shape = (9, 6, 13)
+    field = np.random.default_rng(2).normal(size=(*shape, 3))
+    project = DivergenceFree(shape)
+    spectrum = np.fft.fftn(field, s=project.padded, axes=(0, 1, 2))
+    waves = np.stack(np.meshgrid(*[np.sin(2 * np.pi * np.fft.fftfreq(n)) for n in project.padded], indexing="ij"), -1)
+    square = (waves**2).sum(axis=-1, keepdims=True)
+    # Where the symbol vanishes, the constant and the checkerboards, nothing is taken away.
+    along = (waves * spectrum).sum(axis=-1, keepdims=True) / np.where(square > 1e-9, square, np.inf)
+    whole = np.fft.ifftn(spectrum - waves * along, axes=(0, 1, 2)).real[: shape[0], : shape[1], : shape[2]]
+    np.testing.assert_allclose(project(field), whole, atol=1e-5)
+
+
 def test_uniform_flow_moves_carriers_and_keeps_their_shape():
     control = control_of(lambda x: np.broadcast_to([1.5, -0.5, 0.25], x.shape))
     x = np.random.default_rng(0).uniform(10, 30, (50, 3)).astype(np.float32)
