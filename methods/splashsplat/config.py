@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from splashbench_methods.scaffold_gs import BackgroundSettings
 
 
-#: Of the method; raised when a change alters figures, so that no study takes over runs, or parts of them, from before.
-VERSION = "2"
+#: Of the method; raised when a change alters figures, so that no study takes over runs from before.
+VERSION = "3"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -61,19 +61,20 @@ class SplashSplatConfig(MethodConfig):
     correction: PositiveFloat = 1.0
     kill_outside: PositiveFloat = 0.5
     kill_inside: float | None = Field(-3.0, lt=0)
-    cell_capacity: PositiveInt | None = 6
+    cell_capacity: PositiveInt | None = 8
     #: frames that a carrier lasts on average; None for as long as it stays in the liquid
     lifetime: PositiveInt | None = 2
     shell_depth: PositiveFloat = 1.5
     #: how far beyond the surface carriers are born, too: coarse grids miss what is thinner than a voxel
     shell_outside: float = Field(0, ge=0, le=0.5)
     min_per_cell: PositiveInt = 2
-    max_per_cell: PositiveInt = 4
+    max_per_cell: PositiveInt = 6
     #: no carriers where no training view can see them
     visible_only: bool = True
     # Decoder
     feature_size: PositiveInt = 32
-    children: int = Field(2, ge=1, le=6)
+    #: Gaussians of a carrier
+    children: int = Field(1, ge=1, le=6)
     base_scale: PositiveFloat = 0.35
     # Optimisation
     iterations: int = Field(4000, ge=0)
@@ -97,7 +98,7 @@ class SplashSplatConfig(MethodConfig):
     separation_weight: float = Field(0.1, ge=0)
     colour_weight: float = Field(1.0, ge=0)
     #: carriers whose learned opacity ends below this are dropped; 0 keeps all
-    prune_opacity: float = Field(0.05, ge=0, lt=1)
+    prune_opacity: float = Field(0.01, ge=0, lt=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
 
@@ -121,6 +122,7 @@ class SplashSplatConfig(MethodConfig):
             "lifetime": None,
             "shell_depth": 3.0,
             "max_per_cell": 5,
+            "children": 2,
             "base_scale": 0.7,
             "iterations": 3000,
             "learning_rate_features": 2e-3,
@@ -136,8 +138,9 @@ class SplashSplatConfig(MethodConfig):
             "hull_cells": 160,
             "transport_cells": 80,
             "control_cells": 20,
-            "cell_capacity": 4,
-            "max_per_cell": 2,
+            "cell_capacity": 6,
+            "min_per_cell": 3,
+            "max_per_cell": 4,
             "shell_outside": 0.125,
             "iterations": 800,
             "ssim_every": 2,

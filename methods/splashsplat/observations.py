@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from splashbench_methods.splashsplat.config import VERSION, SplashSplatConfig
+from splashbench_methods.splashsplat.config import SplashSplatConfig
 from splashbench_methods.splashsplat.gate import gated
 from splashbench_methods.splashsplat.model import pack_phi
 from splashbench_methods.splashsplat.motion import Fall, Motion
@@ -36,6 +36,8 @@ Report = Callable[[float, str], None]
 
 # A carrier is seen through at most this many shells of liquid.
 SEEN_THROUGH = 1.5
+# Raised when a change alters what is kept for other runs, so that no study takes over what is from before.
+_REVISION = 2
 # The settings that phi_t depends on.
 _PHI = ("hull_cells", "distance", "container", "detect_failures", "camera_times", "pool", "ballistic")
 _FILE = "phi.float16"
@@ -53,7 +55,7 @@ class Observations:
 
     def __init__(self, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report) -> None:
         self._scene, self._config, self._run, self._report = scene, config, run, report
-        self._key: dict[str, Any] = {"method": VERSION, **config.model_dump(mode="json", include=set(_PHI))}
+        self._key: dict[str, Any] = {"observations": _REVISION, **config.model_dump(mode="json", include=set(_PHI))}
         self._times = scene.times
         self.n_frames = scene.n_frames
         report(0.0, "reading masks")
