@@ -1,7 +1,7 @@
 """Settings of SplashSplat and its presets.
 
 "paper" is the supplement's "Implementation Details"; "best" departs from it where that was measured to help; "quick"
-is for a first look within minutes. The paper's ablations are `variant` and `separation_weight=0`.
+is for a first look within minutes. The paper's ablations are `variant` and, with two children, `separation_weight=0`.
 """
 
 from __future__ import annotations

@@ -169,6 +169,8 @@ class Observations:
     def _stored(self) -> IO[bytes]:
         """`_frames` one after another in a file that the study keeps, float16."""
 
+        kept: list[IO[bytes]] = []
+
         def write() -> IO[bytes]:
             # Nameless: of a run that is killed nothing stays behind.
             stream = tempfile.TemporaryFile(dir=self._run.cache)  # noqa: SIM115
@@ -182,14 +184,16 @@ class Observations:
             return stream
 
         def save(stream: IO[bytes], directory: Path) -> None:
-            stream.seek(0)
-            with (directory / _FILE).open("wb") as kept:
-                shutil.copyfileobj(stream, kept, _COPIED_AT_ONCE)
+            with stream, (directory / _FILE).open("wb") as copy:
+                stream.seek(0)
+                shutil.copyfileobj(stream, copy, _COPIED_AT_ONCE)
+            kept.append((directory / _FILE).open("rb"))  # read from here on, so that there are not two of them for long
 
         def load(directory: Path) -> IO[bytes]:
             return (directory / _FILE).open("rb")
 
-        return self._run.reuse("distances", self._scene, self._key, write, save, load, seeded=False)
+        found = self._run.reuse("distances", self._scene, self._key, write, save, load, seeded=False)
+        return kept[0] if kept else found
 
     def _read(self, stream: IO[bytes]) -> Iterator[np.ndarray]:
         """`_frames` as `_stored` has them, one in memory at a time."""

@@ -17,7 +17,8 @@ from splashbench.parallel import over_range
 #: as in a sheet. With fewer, blocks have to grow; with more, they hold too much.
 _PER_NEIGHBOUR = 0.5
 _SHRINKINGS = 12
-#: Cells along an axis at most, so that a cell's number fits 64 bits; points beyond count as in the last ones.
+#: Cells along an axis at most, around the middle of the points, so that a cell's number fits 64 bits; points beyond
+#: count as in the outermost.
 _MOST_CELLS = 1 << 20
 #: Of a cell's edge: more than rounding can be off by in telling which of so many cells a point is in.
 _MARGIN = 1e-9
@@ -34,9 +35,10 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
     """
     if len(points) == 0:
         return np.zeros(0)
-    low = points.min(axis=0)
-    size = _cell_size(points - low, _PER_NEIGHBOUR * neighbours, radius)
-    cells = _cells(points - low, size)
+    # Of the median: strays far off must not move all others to the edge of the cells there are.
+    offsets = points - np.median(points, axis=0)
+    size = _cell_size(offsets, _PER_NEIGHBOUR * neighbours, radius)
+    cells = _cells(offsets, size)
     shape = cells.max(axis=0) + 1
     keys = _keys(cells, shape)
     order = np.argsort(keys, kind="stable")
@@ -60,8 +62,10 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
 
 
 def _cells(offsets: NDArray[np.float64], size: float) -> NDArray[np.int64]:
-    """Cell [N, 3] of each of `offsets` >= 0 [N, 3]."""
-    return np.minimum(offsets / size, _MOST_CELLS - 1).astype(np.int64)
+    """Cell [N, 3] of each of `offsets` [N, 3] from the middle, counted from 0."""
+    half = _MOST_CELLS // 2
+    cells = np.clip(np.floor(offsets / size), -half, half - 1).astype(np.int64)
+    return cells - cells.min(axis=0)
 
 
 def _keys(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -174,12 +178,14 @@ def _sum_nearest(
                         n_rows += 1
             # Whatever is nearer than this is in the block.
             reach = min((1 - _MARGIN) * half * size, radius)
-            found = 0
+            found = looked_at = 0
             for n in range(n_rows):
+                looked_at += lasts[n] - firsts[n]
                 found = _collect(points, number, firsts[n], lasts[n], reach * reach, squares, found)
             if found >= neighbours or reach >= radius:
                 break
-            half += 1
+            # A wider block is of use only while there is something around this one.
+            half = half + 1 if looked_at < len(points) else _WIDEST + 1
         if found > neighbours:
             _smallest_first(squares, found, neighbours)
             found = neighbours

@@ -47,6 +47,16 @@ def test_sums_are_those_of_a_tree(kind: str, count: int) -> None:
     assert not found[~near].any()
 
 
+def test_one_stray_point_leaves_the_others_their_cells() -> None:
+    points = _points("volume")
+    low = np.concatenate([points, [[-1e10, -1e10, -1e10]]])
+    offsets = low - np.median(low, axis=0)
+    size = neighbours._cell_size(offsets, 32, RADIUS)
+    cells = neighbours._cells(offsets, size)
+    assert len(np.unique(cells[:-1], axis=0)) > 50
+    assert size == pytest.approx(neighbours._cell_size(points - np.median(points, axis=0), 32, RADIUS), rel=1e-2)
+
+
 @pytest.mark.parametrize("share", [0.001, 0.02, 0.1, 5.0, 100.0])
 def test_the_size_of_cells_does_not_matter(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     points = _points("volume")
