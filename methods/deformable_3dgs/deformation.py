@@ -17,10 +17,9 @@ OCTAVES = 10
 
 def encode(values: Tensor, octaves: int = OCTAVES) -> Tensor:
     """[N, D] to [N, D (1 + 2 octaves)]: the values, then sine and cosine of every octave in turn."""
-    parts = [values]
-    for octave in range(octaves):
-        parts += [torch.sin(values * 2.0**octave), torch.cos(values * 2.0**octave)]
-    return torch.cat(parts, dim=1)
+    angles = values[:, None] * 2.0 ** torch.arange(octaves, dtype=values.dtype)[:, None]
+    waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
+    return torch.cat([values, waves.flatten(1)], dim=1)
 
 
 class Deformation(nn.Module):
@@ -58,13 +57,25 @@ class Deformation(nn.Module):
                 head.bias.zero_()
 
     def forward(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
-        positions = (positions - self.center) / self.unit
-        # The time is the same for all: its encoding is worked out once.
-        times = self.times(encode(positions.new_full((1, 1), time), self._time_octaves))
-        encoded = torch.cat([encode(positions), times.expand(len(positions), -1)], dim=1)
-        hidden = encoded
-        for i, layer in enumerate(self.layers):
+        encoded = encode((positions - self.center) / self.unit)
+        # The time is the same for all: its encoding, and what layers make of it, are worked out once.
+        times = self.times(encode(positions.new_full((1, 1), time), self._time_octaves))[0]
+        hidden = torch.relu_(self._of_inputs(self.layers[0], encoded, times))
+        for i, layer in enumerate(self.layers[1:], start=1):
             if i == self._again + 1:
-                hidden = torch.cat([encoded, hidden], dim=1)
-            hidden = torch.relu(layer(hidden))
-        return self.unit * self.shift(hidden), self.turn(hidden), self.unit * self.growth(hidden)
+                hidden = torch.addmm(self._of_inputs(layer, encoded, times), hidden, layer.weight[:, self._inputs :].T)
+            else:
+                hidden = layer(hidden)
+            hidden = torch.relu_(hidden)
+        heads = (self.shift, self.turn, self.growth)
+        out = nn.functional.linear(
+            hidden, torch.cat([head.weight for head in heads]), torch.cat([head.bias for head in heads])
+        )
+        shift, turn, growth = out.split([head.out_features for head in heads], dim=1)
+        return self.unit * shift, turn, self.unit * growth
+
+    def _of_inputs(self, layer: nn.Linear, encoded: Tensor, times: Tensor) -> Tensor:
+        """What `layer` makes of its first inputs, positions `encoded` [N, P] and then `times` [T], with its bias."""
+        places = encoded.shape[1]
+        bias = layer.bias + layer.weight[:, places : self._inputs] @ times
+        return nn.functional.linear(encoded, layer.weight[:, :places], bias)

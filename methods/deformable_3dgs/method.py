@@ -61,7 +61,8 @@ class Deformable3DGS(Method):
                 start, config.start_opacity, config.sh_degree, config.depth, config.width
             )
             extent = camera_extent(scene)
-            optimizer = RowOptimizer(model, rates(config, extent), ROWS, config.iterations)
+            turned = ("deformation.layers",) if config.network_steps == "muon" else ()
+            optimizer = RowOptimizer(model, rates(config, extent), ROWS, config.iterations, orthogonal=turned)
             noise = _TimeNoise(config, scene.n_frames, rng)
 
             def begin_step(step: int) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from splashbench_methods.gaussian_splatting.settings import SplattingSettings
@@ -19,6 +19,7 @@ class Settings(SplattingSettings):
         depth, width: of the network.
         network_factor: times the published learning rate of the network. head_factor: times that, the rate of the heads
             for shifts and turns, growth_factor, of the head for growths; as published, 1.
+        network_steps: whether the layers' matrices learn by "adam", as published, or by "muon", in fewer steps.
         sh_degree: of the colours; one degree more every `sh_every` steps.
     """
 
@@ -44,5 +45,6 @@ class Settings(SplattingSettings):
     network_factor: float = Field(default=1.0, gt=0, le=1000)
     head_factor: float = Field(default=1.0, gt=0, le=1000)
     growth_factor: float = Field(default=1.0, gt=0, le=1000)
+    network_steps: Literal["adam", "muon"] = "adam"
     sh_degree: int = Field(default=1, ge=0, le=3)
     sh_every: int = Field(default=200, ge=1)

@@ -87,11 +87,12 @@ def require_finite(fitted: OfficialFitted, path: Path) -> OfficialFitted:
     """`fitted` itself. Raises SplashbenchError, naming `path`, where its Gaussians come to nothing at either end."""
     with torch.no_grad():
         for seconds in fitted.scene.times[[0, -1]]:
-            state = fitted.model.at(fitted.model_time(float(seconds)))
+            time = fitted.model_time(float(seconds))
             for camera in list(fitted.scene.cameras.values())[:1]:
-                splats = fitted.model.splats(state, fitted.lens(camera))
-                for name in ("means", "factors", "opacities", "colors"):
-                    if not torch.isfinite(getattr(splats, name)).all():
+                splats = fitted.model.splats(fitted.model.at(time), fitted.lens(camera))
+                found = {name: getattr(splats, name) for name in ("means", "factors", "opacities", "colors")}
+                for name, values in [("means", fitted.model.means(time)), *found.items()]:
+                    if not torch.isfinite(values).all():
                         raise SplashbenchError(
                             f"{path}: {name} of the Gaussians overflow at {seconds:g} s; the fit failed, repeat it"
                         )

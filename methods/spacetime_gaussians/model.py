@@ -18,6 +18,7 @@ from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, 
 from splashbench_methods.gaussian_splatting.start import Start
 from torch import Tensor, nn
 
+from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
 
 #: Tables with a row per Gaussian; "features" and "time_features" are of the full model alone.
@@ -28,8 +29,10 @@ FULL_ROWS = (*LITE_ROWS, "features", "time_features")
 
 
 class State(NamedTuple):
-    """The Gaussians at an instant: means [N, 3], factors [N, 3, 3], opacities [N], channels [N, C]."""
+    """The n Gaussians that show at an instant: rows [n], which; means [n, 3], factors [n, 3, 3], opacities [n],
+    channels [n, C]."""
 
+    rows: Tensor
     means: Tensor
     factors: Tensor
     opacities: Tensor
@@ -81,20 +84,36 @@ class SpacetimeModel(DynamicModel):
                 model.decoder[2].weight.zero_()  # the fit begins with the points' own colours
         return model
 
+    def _shown(self, time: float) -> Tensor:
+        """Which Gaussians [n] are drawn at `time`."""
+        with torch.no_grad():
+            fading = torch.exp(-(((time - self.times) / torch.exp(self.log_widths)) ** 2))
+            # With a margin: what is left out is fainter than what the renderer leaves out. What is no number stays.
+            return torch.nonzero(~(torch.sigmoid(self.opacity_logits) * fading < 0.9 * MIN_ALPHA))[:, 0]
+
     def at(self, time: float) -> State:
-        since = time - self.times
-        cut = since.detach()
-        powers = torch.stack([cut, cut**2, cut**3], dim=1)
-        means = self.positions + (powers[:, :, None] * self.motions).sum(dim=1)
-        factors = rotation_matrices(self.quaternions + self.spins * cut[:, None]) * torch.exp(self.log_scales)[:, None]
-        opacities = torch.sigmoid(self.opacity_logits) * torch.exp(-((since / torch.exp(self.log_widths)) ** 2))
-        channels = [self.base]
+        shown = self._shown(time)
+        table = {name: self.get_parameter(name).index_select(0, shown) for name in self.rows}
+        since = time - table["times"]
+        cut = since.detach()[:, None]
+        factors = rotation_matrices(table["quaternions"] + table["spins"] * cut)
+        opacities = torch.sigmoid(table["opacity_logits"]) * torch.exp(-((since / torch.exp(table["log_widths"])) ** 2))
+        channels = [table["base"]]
         if self.full:
-            channels += [self.features, self.time_features * cut[:, None]]
-        return State(means, factors, opacities, torch.cat(channels, dim=1))
+            channels += [table["features"], table["time_features"] * cut]
+        return State(
+            rows=shown,
+            means=_moved(table["positions"], table["motions"], cut),
+            factors=factors * torch.exp(table["log_scales"])[:, None],
+            opacities=opacities,
+            channels=torch.cat(channels, dim=1),
+        )
+
+    def means(self, time: float) -> Tensor:
+        return _moved(self.positions, self.motions, (time - self.times.detach())[:, None])
 
     def splats(self, state: State, camera: Camera) -> Splats:
-        return Splats(state.means, state.factors, state.opacities, state.channels)
+        return Splats(state.means, state.factors, state.opacities, state.channels, rows=state.rows)
 
     def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
         return torch.sigmoid(self.decoded(rendered, camera)) if self.full else rendered
@@ -103,6 +122,12 @@ class SpacetimeModel(DynamicModel):
         """Logits [H, W, 3] of the full model's channels [H, W, 9]."""
         base, features, timed = rendered.split(3, dim=2)
         return base + self.decoder(torch.cat([features, timed, torch.from_numpy(rays(camera))], dim=2))
+
+
+def _moved(positions: Tensor, motions: Tensor, since: Tensor) -> Tensor:
+    """Positions [n, 3] after `since` [n, 1] along the cubics of `motions` [n, 3, 3]."""
+    first, second, third = motions.unbind(1)
+    return positions + since * (first + since * (second + since * third))
 
 
 def rays(camera: Camera) -> np.ndarray:

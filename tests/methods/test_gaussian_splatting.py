@@ -134,6 +134,28 @@ class TestRows:
         assert (model.positions[0] < -0.03).all()  # its momentum goes on
 
 
+def test_an_orthogonal_step_turns_every_direction_of_a_matrix_by_as_much() -> None:
+    network = nn.Sequential(nn.Linear(16, 8), nn.Linear(8, 2))
+    first, bias, last = (p.detach().clone() for p in (network[0].weight, network[0].bias, network[1].weight))
+    rates = {"0": Rate.constant(0.01), "1": Rate.constant(0.01)}
+    optimizer = RowOptimizer(network, rates, (), 10, orthogonal=("0",))
+    strong = torch.zeros(8, 16)
+    strong[0] = 100.0
+    pull = strong + torch.randn(8, 16)
+    (network[0].weight * pull).sum().backward()
+    network[0].bias.grad, network[1].weight.grad = torch.ones(8), torch.ones(2, 8)
+    optimizer.step()
+    step = (network[0].weight.detach() - first).double()
+    sizes = torch.linalg.svdvals(step)
+    assert sizes.min() > 0.4 * sizes.max()
+    assert float((step * pull).sum()) < 0
+    # As large as a step of Adam, .2 of the rate on the mean; what is no matrix, or not named, takes Adam's own.
+    assert float(step.square().mean().sqrt()) == pytest.approx(0.2 * 0.01, rel=0.3)
+    torch.testing.assert_close(network[0].bias.detach(), bias - 0.01)
+    torch.testing.assert_close(network[1].weight.detach(), last - 0.01)
+    assert network[0].weight.grad is None
+
+
 def look() -> Camera:
     w2c = np.eye(4)
     w2c[2, 3] = 3
@@ -161,6 +183,16 @@ class TestDensity:
         assert len(model.positions) == 5
         torch.testing.assert_close(model.positions[4], model.positions[2])
         torch.testing.assert_close(model.log_scales[4], model.log_scales[2])
+
+    def test_what_a_view_leaves_out_is_not_judged_by_it(self) -> None:
+        model = Table(np.array([[-0.5, 0, 0], [0, 0, 0], [0.5, 0, 0]]), scale=0.05)
+        density = density_of(model)
+        seen, rows = model.splats(None, look()), torch.tensor([0, 2])
+        tables = (seen.means, seen.factors, seen.opacities, seen.colors)
+        some = Splats(*(table[rows] for table in tables), rows=rows)
+        density.observe(look(), some, torch.tensor([[1e-4] * 3, [10.0] * 3]))
+        density.after_step(0)
+        np.testing.assert_allclose(model.positions.detach()[:, 0], [-0.5, 0, 0.5, 0.5], atol=1e-6)
 
     def test_large_ones_are_split_within_themselves(self) -> None:
         model = Table(np.zeros((400, 3)), scale=0.5)

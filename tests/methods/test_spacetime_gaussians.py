@@ -59,6 +59,7 @@ class TestFormulas:
         model = random_model()
         state = model.at(0.7)
         v = {name: model.get_parameter(name).detach().numpy() for name in model.rows}
+        assert state.rows.tolist() == list(range(7))
         for i in range(7):
             d = 0.7 - v["times"][i]
             mean = v["positions"][i] + sum(v["motions"][i, k] * d ** (k + 1) for k in range(3))
@@ -77,6 +78,34 @@ class TestFormulas:
         model.at(0.2).opacities.sum().backward()
         assert model.times.grad is not None
         assert model.times.grad.abs().min() > 0
+
+    def test_what_has_faded_is_left_out_and_changes_no_pixel(self, balls: Scene) -> None:
+        model = random_model(n=60)
+        with torch.no_grad():
+            camera = balls.cameras["1"]
+            model.positions[:] = torch.tensor(camera.center + 2 * camera.w2c[2, :3])
+            model.log_scales -= 3
+            model.times[:], model.log_widths[:] = 0.3, 0.0
+            model.times[::2] = 5.0
+            model.opacity_logits[1] = -20.0
+        model = model.float()
+        state = model.at(0.2)
+        assert state.rows.tolist() == [i for i in range(60) if i % 2 and i != 1]
+        assert len(model.means(0.2)) == 60
+        np.testing.assert_array_equal(model.means(0.2)[state.rows].detach(), state.means.detach())
+        image = model.view(model.splats(state, camera), camera, 0.2)
+        image.square().sum().backward()
+        with torch.no_grad():
+            kept = {name: model.get_parameter(name)[state.rows].clone() for name in model.rows}
+        alone = SpacetimeModel(len(state.rows), True)
+        alone.decoder = model.decoder
+        for name, values in kept.items():
+            setattr(alone, name, torch.nn.Parameter(values))
+        again = alone.view(alone.splats(alone.at(0.2), camera), camera, 0.2)
+        np.testing.assert_array_equal(image.detach(), again.detach())
+        assert model.positions.grad is not None
+        assert not model.positions.grad[::2].any()
+        assert model.positions.grad[3::2].any()
 
     def test_the_decoder_sees_features_and_ray(self, balls: Scene) -> None:
         model = random_model()
