@@ -15,7 +15,7 @@ examples:
   splashbench study ablate my_study.toml OUT --jobs 2
   splashbench study ablate ablation OUT --scenes SCENE --only per_frame      one row; the others stay as they are
 
-SPEC is a TOML file, or one of: ablation, baselines, best, interpolation, masks, presets, sensitivity, views
+SPEC is a TOML file, or one of: ablation, baselines, best, interpolation, masks, sensitivity, views
 (docs/study.md). OUT gets table.md, table.csv, runs.csv, table.json, chart.png and chart.svg. The same command again
 goes on where it stopped. Failed runs are rows.
 """
