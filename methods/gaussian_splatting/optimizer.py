@@ -69,10 +69,10 @@ class RowOptimizer:
         matrices: list[dict[str, Any]] = []
         for name in self.rates:
             found = self._parameters(name)
-            turned = [p for p in found if p.ndim == 2] if name in orthogonal else []
-            if turned:
-                matrices.append({"params": turned, "name": name})
-            groups.append({"params": [p for p in found if not turned or p.ndim != 2], "name": name})
+            if name in orthogonal:
+                matrices.append({"params": [p for p in found if p.ndim == 2], "name": name})
+                found = [p for p in found if p.ndim != 2]
+            groups.append({"params": found, "name": name})
         self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self._optimizers: list[torch.optim.Optimizer] = [self.adam]
         if matrices:

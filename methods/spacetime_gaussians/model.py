@@ -87,9 +87,9 @@ class SpacetimeModel(DynamicModel):
     def _shown(self, time: float) -> Tensor:
         """Which Gaussians [n] are drawn at `time`."""
         with torch.no_grad():
-            fading = torch.exp(-(((time - self.times) / torch.exp(self.log_widths)) ** 2))
+            opacities = _opacities(self.opacity_logits, time - self.times, self.log_widths)
             # With a margin: what is left out is fainter than what the renderer leaves out. What is no number stays.
-            return torch.nonzero(~(torch.sigmoid(self.opacity_logits) * fading < 0.9 * MIN_ALPHA))[:, 0]
+            return torch.nonzero(~(opacities < 0.9 * MIN_ALPHA))[:, 0]
 
     def at(self, time: float) -> State:
         shown = self._shown(time)
@@ -97,7 +97,6 @@ class SpacetimeModel(DynamicModel):
         since = time - table["times"]
         cut = since.detach()[:, None]
         factors = rotation_matrices(table["quaternions"] + table["spins"] * cut)
-        opacities = torch.sigmoid(table["opacity_logits"]) * torch.exp(-((since / torch.exp(table["log_widths"])) ** 2))
         channels = [table["base"]]
         if self.full:
             channels += [table["features"], table["time_features"] * cut]
@@ -105,7 +104,7 @@ class SpacetimeModel(DynamicModel):
             rows=shown,
             means=_moved(table["positions"], table["motions"], cut),
             factors=factors * torch.exp(table["log_scales"])[:, None],
-            opacities=opacities,
+            opacities=_opacities(table["opacity_logits"], since, table["log_widths"]),
             channels=torch.cat(channels, dim=1),
         )
 
@@ -122,6 +121,11 @@ class SpacetimeModel(DynamicModel):
         """Logits [H, W, 3] of the full model's channels [H, W, 9]."""
         base, features, timed = rendered.split(3, dim=2)
         return base + self.decoder(torch.cat([features, timed, torch.from_numpy(rays(camera))], dim=2))
+
+
+def _opacities(logits: Tensor, since: Tensor, log_widths: Tensor) -> Tensor:
+    """Opacities [n], `since` [n] recordings after Gaussians show most."""
+    return torch.sigmoid(logits) * torch.exp(-((since / torch.exp(log_widths)) ** 2))
 
 
 def _moved(positions: Tensor, motions: Tensor, since: Tensor) -> Tensor:
