@@ -16,20 +16,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-_SHORT_LAST = 0.025
+# A short fit learns most where rates stay high for long, and has come to rest where they end before it does.
+_SHORT_LAST, _SHORT_HOLD, _SHORT_UNTIL = 0.025, 0.35, 0.75
+# Next to matrices that take Muon's steps, biases that learn as fast by Adam's let units die.
+_BESIDE_MUON = 0.1
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A learning rate that falls exponentially from `first` to `last` over the share `until` of the fit.
+    """A learning rate that falls exponentially from `first` to `last` until the share `until` of the fit.
 
-    begin: share of the fit before which it is 0.
+    hold: share of the fit until which it stays `first`. begin: share before which it is 0.
     """
 
     first: float
     last: float
     until: float = 1.0
     begin: float = 0.0
+    hold: float = 0.0
 
     @classmethod
     def constant(cls, value: float) -> Rate:
@@ -37,14 +41,15 @@ class Rate:
         return cls(value, value)
 
     def short(self) -> Rate:
-        """The same at first, for a short fit: it falls to a fortieth until the end."""
-        return Rate(self.first, self.first * _SHORT_LAST, begin=self.begin)
+        """The same for a good third of a short fit; then it falls to a fortieth, for the last quarter."""
+        return Rate(self.first, self.first * _SHORT_LAST, _SHORT_UNTIL, self.begin, _SHORT_HOLD)
 
     def at(self, done: float) -> float:
         """The rate when the share `done` of the fit is done."""
         if done < self.begin:
             return 0.0
-        return self.first * (self.last / self.first) ** min(1.0, done / self.until)
+        fallen = min(1.0, max(0.0, done - self.hold) / (self.until - self.hold))
+        return self.first * (self.last / self.first) ** fallen
 
 
 class RowOptimizer:
@@ -52,7 +57,7 @@ class RowOptimizer:
 
     rates: by attribute of the model, a parameter or a module; "part.inner" for one of a part's. rows: those of them
     that have a row per primitive. orthogonal: those of them whose matrices take Muon's steps; a step's entries are as
-    large as Adam's at the same rate.
+    large as Adam's at the same rate. What else these have learns at a tenth of the rate.
     """
 
     def __init__(
@@ -68,11 +73,11 @@ class RowOptimizer:
         groups: list[dict[str, Any]] = []
         matrices: list[dict[str, Any]] = []
         for name in self.rates:
-            found = self._parameters(name)
+            found, share = self._parameters(name), 1.0
             if name in orthogonal:
-                matrices.append({"params": [p for p in found if p.ndim == 2], "name": name})
-                found = [p for p in found if p.ndim != 2]
-            groups.append({"params": found, "name": name})
+                matrices.append({"params": [p for p in found if p.ndim == 2], "name": name, "share": share})
+                found, share = [p for p in found if p.ndim != 2], _BESIDE_MUON
+            groups.append({"params": found, "name": name, "share": share})
         self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self._optimizers: list[torch.optim.Optimizer] = [self.adam]
         if matrices:
@@ -93,7 +98,7 @@ class RowOptimizer:
         """One step along the gradients, which are then gone."""
         for optimizer in self._optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = self.rates[group["name"]].at(self.done)
+                group["lr"] = group["share"] * self.rates[group["name"]].at(self.done)
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         self.step_count += 1

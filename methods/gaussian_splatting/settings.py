@@ -28,7 +28,8 @@ class SplattingSettings(MethodConfig):
         reset_every: steps between opacity resets, 0 for never; reset_until: share after which there are none.
         rate_factor: times the published learning rates of where Gaussians are and how they move.
         color_factor: times the published learning rates of colours and features.
-        rates: whether every learning rate falls to a fortieth ("short"), or as published.
+        rates: whether every learning rate stays for a good third of the fit and has fallen to a fortieth by its last
+            quarter ("short"), or as published.
         longest_side: photographs are shrunk to this many pixels.
     """
 

@@ -34,6 +34,7 @@ class Scaffold4D(Method):
 
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
+    version: ClassVar[str] = "2"  # since short fits hold their rates and come to rest
     Config: ClassVar[type[MethodConfig]] = Settings
     mixed: ClassVar[bool] = True
 

@@ -21,7 +21,7 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 3000, "views_per_step": 1, "hull_points": 20_000, "most": 30_000, "rate_factor": 8.0,
+            "iterations": 6000, "views_per_step": 1, "hull_points": 40_000, "most": 60_000, "rate_factor": 3.0,
             "color_factor": 4.0, "new_times": "kept",
         },
         "paper": {
