@@ -5,6 +5,7 @@ PNG and SVG; the bytes depend on the results alone.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from math import inf
 from pathlib import Path
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 # Okabe and Ito: blue for rows, vermilion for the baseline, grey for controls.
 _BLUE, _VERMILION, _GREY = "#0072B2", "#D55E00", "#666666"
 _COLUMNS = 3
+# More do not fit over a panel in one line.
+_TITLE_LETTERS = 42
 _STYLE: dict[str, Any] = {
     "svg.hashsalt": "splashbench",
     "font.family": "DejaVu Sans",
@@ -69,7 +72,8 @@ def draw_chart(table: Table, out: Path) -> list[Path]:
 
 def _panel(axes: Axes, table: Table, name: str, reported: bool, named: bool) -> None:
     better = {"higher": ", higher is better →", "lower": ", ← lower is better", None: ""}[metric_of(name).better]
-    axes.set_title(f"{label(name, arrow=False)}{', as the paper reports' if reported else better}")
+    title = f"{label(name, arrow=False)}{', as the paper reports' if reported else better}"
+    axes.set_title(textwrap.fill(title, _TITLE_LETTERS))
     values = {row.name: _value(row, name, reported) for row in table.rows}
     baseline = values[table.plan.spec.baseline]
     if baseline is not None:
