@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 # A short fit learns most where rates stay high for long, and has come to rest where they end before it does.
 _SHORT_LAST, _SHORT_HOLD, _SHORT_UNTIL = 0.025, 0.35, 0.75
-# Next to matrices that take Muon's steps, biases that learn as fast by Adam's let units die.
+# Beside matrices that take Muon's steps; fits whose biases learned as fast by Adam were spoilt at high rates.
 _BESIDE_MUON = 0.1
 
 
