@@ -19,13 +19,16 @@ from splashbench.adapter.contract import Method, MethodConfig, Run
 from splashbench.files import read_npz
 from splashbench.scene import TrainingScene
 
+# Steps after which the published rates have come to their end; a fit of a real scene ends before, with 20 000.
+_POSITIONS_FALL_FOR, _NETWORK_FALLS_FOR = 30_000, 40_000
+
 
 def rates(settings: Settings, extent: float) -> dict[str, Rate]:
     """Learning rates by table; `extent` of the cameras, scene units."""
     factor, color = settings.rate_factor, 2.5e-3 * settings.color_factor
     position = 1.6e-4 * extent * factor
     published = {
-        "positions": Rate(position, position / 100, until=0.75),
+        "positions": Rate(position, position / 100, until=_POSITIONS_FALL_FOR / settings.iterations),
         "log_scales": Rate.constant(5e-3),
         "quaternions": Rate.constant(1e-3),
         "opacity_logits": Rate.constant(0.05),
@@ -40,7 +43,8 @@ def rates(settings: Settings, extent: float) -> dict[str, Rate]:
     }
     for part, share in parts.items():
         network = settings.network_factor * share
-        published[f"deformation.{part}"] = Rate(8e-4 * network, 1.6e-6 * network, begin=settings.warm_up)
+        until = _NETWORK_FALLS_FOR / settings.iterations
+        published[f"deformation.{part}"] = Rate(8e-4 * network, 1.6e-6 * network, until, settings.warm_up)
     if settings.rates == "published":
         return published
     return {name: rate.short() for name, rate in published.items()}

@@ -96,6 +96,7 @@ class OfficialDeformable3DGS(Importer):
     id: ClassVar[str] = "deformable_3dgs"
     title: ClassVar[str] = "Deformable-3DGS, the official code's models"
     formats: ClassVar[tuple[str, ...]] = ("nerfies",)
+    mixed: ClassVar[bool] = True
 
     def read(self, output: Path, export: Path, scene: TrainingScene) -> OfficialFitted:
         path = last_point_cloud(output)

@@ -31,10 +31,11 @@ class Settings(SplattingSettings):
             "growth_factor": 0.003, "network_steps": "muon",
         },
         "paper": {
-            "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "depth": 8, "width": 256, "sh_degree": 3,
-            "sh_every": 1000, "static": "points", "static_points": 100_000, "hull_points": 100_000,
-            "start_opacity": 0.1, "most": 500_000, "grow_from": 0.025, "grow_until": 0.75, "prune_until": 0.75,
-            "reset_every": 3000, "reset_until": 0.75, "rates": "published", "longest_side": 16384,
+            "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "time_noise_until": 1.0, "depth": 8,
+            "width": 256, "sh_degree": 3, "sh_every": 1000, "static": "points", "static_points": 100_000,
+            "hull_points": 100_000, "start_opacity": 0.1, "most": 500_000, "grow_from": 0.025, "grow_until": 0.75,
+            "prune_until": 0.75, "reset_every": 3000, "reset_until": 0.75, "rates": "published",
+            "longest_side": 16384,
         },
     }  # fmt: skip
 

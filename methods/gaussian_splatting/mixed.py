@@ -70,14 +70,21 @@ class MixedFitted(Fitted):
     def liquid(self, t: int) -> NDArray[np.bool_]:
         """bool [N]: the Gaussians that the silhouettes of timestep `t` allow to be liquid."""
         if t not in self._liquid:
-            self._liquid[t] = silhouette_consistent(self._means(t), self._masked, t)
+            # A silhouette is of its photograph's own instant.
+            times = {
+                name: self.model_time(float(self.scene.camera_times[name][t]), self.scene.cameras[name])
+                for name in self.scene.train
+            }
+            means = {time: self._means(time) for time in set(times.values())}
+            seen = {name: means[time] for name, time in times.items()}
+            self._liquid[t] = silhouette_consistent(seen, self._masked, t)
         return self._liquid[t]
 
     @torch.no_grad()
-    def _means(self, t: int) -> NDArray[np.float32]:
-        """Means [N, 3] of all Gaussians at timestep `t`."""
+    def _means(self, time: float) -> NDArray[np.float32]:
+        """Means [N, 3] of all Gaussians at the model's `time`."""
         with one_torch_thread():
-            return np.asarray(self.model.means(self.model_time(float(self.scene.times[t]))).numpy())
+            return np.asarray(self.model.means(time).numpy())
 
     @torch.no_grad()
     def _drawn(self, t: int, count: int) -> NDArray[np.bool_]:
@@ -96,7 +103,8 @@ class MixedFitted(Fitted):
         steps = range(self.scene.n_frames)
         active = np.stack([liquid & self._drawn(t, len(liquid)) for t, liquid in ((t, self.liquid(t)) for t in steps)])
         ever = active.any(axis=0)
-        return Particles(np.stack([self._means(t)[ever] for t in steps]), active[:, ever])
+        times = [self.model_time(float(seconds)) for seconds in self.scene.times]
+        return Particles(np.stack([self._means(time)[ever] for time in times]), active[:, ever])
 
     def save(self, directory: Path) -> None:
         arrays = {name: tensor.detach().numpy() for name, tensor in self.model.state_dict().items()}

@@ -130,6 +130,7 @@ class OfficialScaffold4D(Importer):
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS, the official code's models"
     formats: ClassVar[tuple[str, ...]] = ("blender",)
+    mixed: ClassVar[bool] = True
 
     def read(self, output: Path, export: Path, scene: TrainingScene) -> OfficialFitted:
         path, arguments = last_point_cloud(output), Arguments.read(output)

@@ -5,6 +5,7 @@ cfg_args. A full cloud has 38 numbers per Gaussian, a lite one 32. Against space
 
     time is (timestep - first) / duration, whenever the photograph was taken
     the decoder ends in a sigmoid (`sandwich`), or clamped to [0, 1] (`sandwichnoact`)
+    behind a lite model there may be white
     the loader `colmap` puts principal points in the middle; the others do so where cy is in the middle
 """
 
@@ -84,6 +85,7 @@ class OfficialSpacetimeGaussians(Importer):
     id: ClassVar[str] = "spacetime_gaussians"
     title: ClassVar[str] = "SpacetimeGaussians, the official code's models, full and lite"
     formats: ClassVar[tuple[str, ...]] = ("colmap",)
+    mixed: ClassVar[bool] = True
 
     def read(self, output: Path, export: Path, scene: TrainingScene) -> OfficialFitted:
         path, arguments = last_point_cloud(output), Arguments.read(output)
@@ -94,6 +96,13 @@ class OfficialSpacetimeGaussians(Importer):
         first = _FIRST.match(Path(arguments.text("source_path")).name)
         model.clock.copy_(torch.tensor([int(first[1]) if first else 0, duration], dtype=torch.float64))
         model.centered.fill_(loader.startswith("colmap"))
+        white = arguments.flag("white_background")
+        if white and model.full:
+            raise SplashbenchError(
+                f"{arguments.path}: white_background, of which that code takes three channels for the full model's "
+                "nine; train without it"
+            )
+        model.background.fill_(float(white))
         if model.full:
             decoder = arguments.text("rgbfunction")
             if decoder not in _SIGMOID:

@@ -116,7 +116,7 @@ def _identity(code: ExternalCode, scene: Scene, preset: str, seed: int, device: 
         identity = Identity(
             method=code.name,
             method_version=code.version,
-            mixed=code.mixed,
+            mixed=code.mixed or bool(code.importer and load_importer(code.importer).mixed),
             preset=preset,
             settings=without_nulls(settings),
             seed=seed,

@@ -26,6 +26,8 @@ class Importer(ABC):
     title: ClassVar[str]
     #: Formats of `scene export` that the code trains on; its output is in their coordinates and times.
     formats: ClassVar[tuple[str, ...]]
+    #: True where one set of primitives holds background and liquid, as `Method.mixed`; no --mixed is needed then.
+    mixed: ClassVar[bool] = False
 
     @abstractmethod
     def read(self, output: Path, export: Path, scene: TrainingScene) -> Fitted:

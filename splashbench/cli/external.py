@@ -52,7 +52,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--shell", action="store_true", help="commands are for /bin/sh: pipes, variables, several lines")
     group.add_argument("--directory", type=Path, metavar="DIR", help="where commands run (default: here)")
     group.add_argument("--method-version", metavar="TEXT", help='of the code (default "1")')
-    group.add_argument("--mixed", action="store_true", help="one set of primitives is background and liquid")
+    group.add_argument(
+        "--mixed",
+        action="store_true",
+        help="one set of primitives is background and liquid; the importers of official codes say so themselves",
+    )
     group.add_argument("--blank-test-images", action="store_true", help="black images, for codes that open them")
     group.add_argument("--masks", action="store_true", help="export the training views' liquid masks too")
     add_points(group, default=None)

@@ -7,6 +7,8 @@ lost with the background.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,13 +27,19 @@ def inside_mask(points: NDArray[np.floating], camera: Camera, mask: NDArray[np.b
     return inside
 
 
-def silhouette_consistent(points: NDArray[np.floating], scene: MaskedScene, t: int) -> NDArray[np.bool_]:
-    """Which of `points` [N, 3], scene units, lie inside the silhouettes of all training views at timestep `t`."""
-    consistent = np.isfinite(points).all(axis=1)
+def silhouette_consistent(
+    points: NDArray[np.floating] | Mapping[str, NDArray[np.floating]], scene: MaskedScene, t: int
+) -> NDArray[np.bool_]:
+    """Which of `points` [N, 3], scene units, lie inside the silhouettes of all training views at timestep `t`.
+
+    points: the same for all views, or by training view, where each was photographed at an instant of its own.
+    """
+    by_view = points if isinstance(points, Mapping) else dict.fromkeys(scene.train, points)
+    consistent = np.logical_and.reduce([np.isfinite(by_view[name]).all(axis=1) for name in scene.train])
     for name in scene.train:
         candidates = np.flatnonzero(consistent)
         if candidates.size == 0:
             break
-        inside = inside_mask(points[candidates], scene.cameras[name], scene.mask(name, t))
+        inside = inside_mask(by_view[name][candidates], scene.cameras[name], scene.mask(name, t))
         consistent[candidates[~inside]] = False
     return consistent

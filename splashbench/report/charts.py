@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from splashbench.files import atomic_path
 from splashbench.report.results import Source
 from splashbench.report.speed_accuracy import Entry, Machine, Summary, machines, pareto_front, reported_machine
-from splashbench.score.metrics import METRICS
+from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE, METRICS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +64,7 @@ def speed_accuracy_chart(sources: Sequence[Source], out: Path, with_paper: bool 
             _panel(right, row, row.quality_name(), looks, largest)
             left.set_title(row.title)
         figure.suptitle("Speed against accuracy, test views", x=0.01, ha="left", fontsize=12, fontweight="bold")
-        _legend(figure, looks, largest, any(row.reported for row in rows))
+        _legend(figure, looks, largest, any(row.reported for row in rows), _filtered(rows))
         paths = [Path(out, "speed_accuracy.png"), Path(out, "speed_accuracy.svg")]
         for path, metadata in zip(paths, ({"Software": None}, {"Date": None, "Creator": None})):
             with atomic_path(path) as temporary:
@@ -190,14 +191,21 @@ def _draw_failures(axes: Axes, row: Machine, higher: bool) -> None:
         )
 
 
-def _legend(figure: Any, looks: dict[str, tuple[str, str]], largest: float, reported: bool) -> None:
+def _filtered(rows: list[Machine]) -> set[str]:
+    """Labels of mixed methods of which a panel shows a figure that rests on the protocol's filter."""
+    shown = [row for row in rows if METRICS[row.perceptual_name()].filtered or METRICS[row.quality_name()].filtered]
+    return {entry.label for row in shown for entry in row.entries if entry.mixed}
+
+
+def _legend(figure: Any, looks: dict[str, tuple[str, str]], largest: float, reported: bool, filtered: set[str]) -> None:
     from matplotlib.lines import Line2D
 
     def mark(shape: str, area: float, **style: Any) -> Line2D:
         return Line2D([], [], linestyle="none", marker=shape, markersize=area**0.5, **style)
 
     handles = [
-        mark(shape, 60, color=colour, markeredgewidth=0, label=label) for label, (colour, shape) in looks.items()
+        mark(shape, 60, color=colour, markeredgewidth=0, label=label + (FILTER_MARK if label in filtered else ""))
+        for label, (colour, shape) in looks.items()
     ]
     handles.append(mark("o", 12, color=_GREY, alpha=0.4, markeredgewidth=0, label="one run"))
     handles.append(Line2D([], [], color="#AAAAAA", linewidth=1.2, drawstyle="steps-post", label="Pareto front"))
@@ -208,4 +216,9 @@ def _legend(figure: Any, looks: dict[str, tuple[str, str]], largest: float, repo
     if reported:
         hollow = mark("s", 60, markerfacecolor="none", markeredgecolor=_GREY, label="hollow: as reported by the paper")
         handles.append(hollow)
-    figure.legend(handles=handles, loc="outside lower left", ncols=4, frameon=False, fontsize=8, labelspacing=1.0)
+    legend = figure.legend(
+        handles=handles, loc="outside lower left", ncols=4, frameon=False, fontsize=8, labelspacing=1.0
+    )
+    if filtered:
+        legend.set_title(fill(FILTER_NOTE.replace("figure", "mIoU"), 150), prop={"size": 7.5})
+        legend.set_alignment("left")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import shorten
+from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from splashbench.files import atomic_path
 from splashbench.scene import Scene
+from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,6 +62,8 @@ def contact_sheet(scene: Scene, submissions: Sequence[Any], out_png: Path, times
                 _show(grid[row + 1, column], submission.alpha(camera, t), mask)
                 row += 2
         _label_rows(grid, submissions)
+        if any(_ok(submission) and submission.identity.mixed for submission in submissions):
+            figure.supxlabel(fill(FILTER_NOTE, int(17 * size[0])), x=0.01, ha="left", fontsize=7, color="#666666")
         with atomic_path(Path(out_png)) as temporary:
             figure.savefig(temporary, format="png", dpi=150, facecolor="white", metadata={"Software": None})
     return Path(out_png)
@@ -101,7 +104,7 @@ def _label_rows(grid: NDArray, submissions: Sequence[Any]) -> None:
         name = f"{identity.method}\n{identity.preset}, seed {identity.seed}"
         if _ok(submission):
             grid[row, 0].set_ylabel(f"{name}\nrender")
-            grid[row + 1, 0].set_ylabel("foreground\nopacity")
+            grid[row + 1, 0].set_ylabel(f"foreground\nopacity{FILTER_MARK if identity.mixed else ''}")
             row += 2
         else:
             status = getattr(submission.status, "value", submission.status)

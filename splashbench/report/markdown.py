@@ -10,7 +10,7 @@ from statistics import fmean
 from splashbench.report.leaderboard import Row, table_of
 from splashbench.report.reported import reported_table
 from splashbench.report.results import Source, hardware_label, settings_digest
-from splashbench.score.metrics import METRICS, TRUTH_METRICS, format_value
+from splashbench.score.metrics import FILTER_NOTE, METRICS, TRUTH_METRICS, filter_mark, format_value
 
 _QUALITY = (
     *("psnr", "dpsnr_bg", "ssim", "ssim_fg", "lpips", "miou", "spill", "spill_rgb", "jitter_error"),
@@ -40,6 +40,8 @@ def to_markdown(rows: Sequence[Row], sources: Sequence[Source], with_paper: bool
         "↓ lower is better. Test views only. A row is the median over seeds, ± half the spread; **bold** is the best "
         "of the scene, controls aside. *Italic* rows are controls: yardsticks, not reconstructions.",
     ]
+    if any(row.first.mixed for row in rows):
+        parts.append(FILTER_NOTE)
     for (scene, digest, protocol), group in groupby(rows, key=table_of):
         members = list(group)
         parts += [f"## {scene} (protocol {protocol}, scene {digest[:8]})", _scene_table(members, letters)]
@@ -115,6 +117,7 @@ def _quality_cell(row: Row, name: str, best: float | None) -> str:
     text = format_value(name, value, _NONE)
     if value is not None and value == best and not row.first.control:
         text = f"**{text}**"
+    text += filter_mark(METRICS[name], row.first.mixed, value)
     return text if spread is None else f"{text} ± {format_value(name, spread / 2)}"
 
 
@@ -159,7 +162,9 @@ def _mean_table(rows: list[Row], scenes: set[str], letters: dict[str, str]) -> s
 def _mean_cell(group: list[Row], name: str) -> str:
     values = [row.value(name) for row in group]
     known = [value for value in values if value is not None]
-    return format_value(name, fmean(known), _NONE) if len(known) == len(values) else _NONE
+    if not known or len(known) < len(values):
+        return _NONE
+    return format_value(name, fmean(known)) + filter_mark(METRICS[name], group[0].first.mixed, known[0])
 
 
 def _failures(rows: Sequence[Row]) -> list[str]:
@@ -174,7 +179,10 @@ def _claims(rows: Sequence[Row]) -> list[str]:
         for run in row.runs:
             for name, claimed in sorted(run.claimed.items()):
                 verified = run.value(name)
-                shown = format_value(name, verified, "not verified") if name in METRICS else "no metric of ours"
+                shown = "no metric of ours"
+                if name in METRICS:
+                    shown = format_value(name, verified, "not verified")
+                    shown += filter_mark(METRICS[name], run.mixed, verified)
                 lines.append(f"{_run_name(row)}, {_one_line(name)}: claimed {claimed:g}, verified {shown}")
     return ["## Claimed by the submitters", _bullets(lines)] if lines else []
 

@@ -31,9 +31,10 @@ class Dot:
 
 @dataclass
 class Entry:
-    """A method with its settings on one machine."""
+    """A method with its settings on one machine. mixed: see docs/protocol.md, "Mixed methods"."""
 
     label: str
+    mixed: bool = False
     dots: list[Dot] = field(default_factory=list)
     scenes: set[str] = field(default_factory=set)
 
@@ -141,7 +142,7 @@ def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
         else:
             label = names[_key(result)]
             memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
-            entry = entries.setdefault(label, Entry(label))
+            entry = entries.setdefault(label, Entry(label, result.mixed))
             entry.dots.append(Dot(seconds, values, memory))
             entry.scenes.add(result.digests.scene)
     machine.entries = [entries[label] for label in sorted(entries)]
@@ -181,6 +182,6 @@ def reported_machine() -> Machine:
         values = {name: value for name in ("psnr", "lpips") if isinstance(value := row[name], float)}
         memory = row["memory_gib"]
         bytes_ = memory * 2**30 if isinstance(memory, float) else None
-        machine.entries.append(Entry(str(row["method"]), [Dot(minutes * 60, values, bytes_)]))
+        machine.entries.append(Entry(str(row["method"]), dots=[Dot(minutes * 60, values, bytes_)]))
         machine.title = f"{row['hardware']} by the paper · means over {row['scene_set']}"
     return machine

@@ -37,6 +37,14 @@ class Metric:
     version: int = 1
 
     @property
+    def filtered(self) -> bool:
+        """Whether, of a mixed method, the figure is of those primitives alone that the silhouettes allow to be liquid.
+
+        That filter is ours, no part of the method (observe/consistency.py), so tables and charts mark such figures.
+        """
+        return self.group in ("particles", "truth") or self.name in ("spill", "miou", "carriers_per_frame")
+
+    @property
     def label(self) -> str:
         """Title with unit and arrow, for a table's head."""
         arrow = {"higher": " ↑", "lower": " ↓", None: ""}[self.better]
@@ -85,6 +93,20 @@ METRICS: dict[str, Metric] = {
 
 #: The figures against true particles, which made-up scenes alone have.
 TRUTH_METRICS = tuple(name for name, metric in METRICS.items() if metric.group == "truth")
+
+
+#: Stands behind figures of mixed methods that rest on the filter, or behind the methods' names in a chart's legend.
+FILTER_MARK = "†"
+FILTER_NOTE = (
+    f"{FILTER_MARK} One set of primitives is background and liquid. The figure is of those alone that lie inside the "
+    "silhouettes of all training views: a filter of this protocol, no part of the method. It loses liquid that only "
+    "some views see."
+)
+
+
+def filter_mark(metric: Metric, mixed: bool, value: float | None) -> str:
+    """What stands behind `value` of `metric`; mixed: whether the method is."""
+    return FILTER_MARK if mixed and metric.filtered and value is not None else ""
 
 
 def format_value(name: str, value: float | None, missing: str = "") -> str:

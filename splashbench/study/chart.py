@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splashbench.files import atomic_path
+from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
 from splashbench.study.shown import label, scaled
 from splashbench.study.spec import metric_of
 from splashbench.study.table import Row, Table
@@ -62,6 +63,8 @@ def draw_chart(table: Table, out: Path) -> list[Path]:
         figure.suptitle(spec.title or f"Study {spec.name}", x=0.01, ha="left", fontsize=11.5, fontweight="bold")
         legend = "Mark: mean over scenes and seeds. Bar: one standard deviation over seeds to either side. Dots: seeds."
         legend += f" Dashed: {spec.baseline}." + (" Hollow: as the paper reports, of other scenes." if reported else "")
+        if any(row.mixed for row in table.rows):
+            legend += "\n" + textwrap.fill(FILTER_NOTE, 190)
         figure.supxlabel(legend, x=0.01, ha="left", fontsize=7.5, color=_GREY)
         paths = [Path(out, "chart.png"), Path(out, "chart.svg")]
         for path, metadata in zip(paths, ({"Software": None}, {"Date": None, "Creator": None})):
@@ -94,6 +97,8 @@ def _panel(axes: Axes, table: Table, name: str, reported: bool, named: bool) -> 
         axes.scatter(
             [value], [y], s=34, facecolors="none" if reported else colour, edgecolors=colour, linewidths=1.3, zorder=4
         )
+        if row.mixed and metric_of(name).filtered and not reported:
+            axes.annotate(FILTER_MARK, (value, y), (5, 1), textcoords="offset points", fontsize=8, zorder=5)
     axes.set_ylim(len(table.rows) - 0.5, -0.5)
     axes.set_yticks(range(len(table.rows)), [_name(row, reported) if named else "" for row in table.rows])
     axes.tick_params(axis="y", length=0)

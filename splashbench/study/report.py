@@ -26,17 +26,21 @@ def write_report(table: Table, out: Path, command: str) -> list[Path]:
 
 
 def table_csv(table: Table) -> str:
-    """A row per variant: mean, standard deviation over seeds, difference to the baseline and its deviation."""
+    """A row per variant: mean, standard deviation over seeds, difference to the baseline and its deviation.
+
+    mixed: of a mixed method, whose filtered figures rest on the protocol's filter (docs/protocol.md).
+    """
     metrics = table.plan.spec.metrics
     suffixes = ("", "_std", "_difference", "_difference_std")
-    lines = [["variant", "runs", "failed", "not_run", *(f"{name}{suffix}" for name in metrics for suffix in suffixes)]]
+    figures = [f"{name}{suffix}" for name in metrics for suffix in suffixes]
+    lines = [["variant", "runs", "failed", "not_run", *figures, "mixed"]]
     for row in table.rows:
         line = [row.name, str(row.count("ok")), str(len(row.failed)), str(row.count(NOT_RUN))]
         for name in metrics:
             cell = row.cells[name]
             for value in (cell.mean, cell.std, cell.difference, cell.difference_std):
                 line.append(_exact(value))
-        lines.append(line)
+        lines.append([*line, str(row.mixed).lower()])
     return _csv(lines)
 
 
@@ -72,6 +76,7 @@ def as_json(table: Table, command: str) -> dict[str, Any]:
                 "title": metric_of(name).title,
                 "unit": metric_of(name).unit,
                 "better": metric_of(name).better,
+                "filtered": metric_of(name).filtered,
                 "scenes": list(table.scenes_of[name]),
             }
             for name in plan.spec.metrics
@@ -80,6 +85,7 @@ def as_json(table: Table, command: str) -> dict[str, Any]:
             {
                 "variant": row.name,
                 "control": row.control,
+                "mixed": row.mixed,
                 "ok": row.count("ok"),
                 "failed": len(row.failed),
                 "not_run": row.count(NOT_RUN),

@@ -91,6 +91,11 @@ class Row:
         return tuple(run for run in self.runs if run.status not in ("ok", NOT_RUN))
 
     @property
+    def mixed(self) -> bool:
+        """Whether it is of a mixed method, whose liquid the protocol's filter picks out; known from its results."""
+        return any(run.result is not None and run.result.mixed for run in self.runs)
+
+    @property
     def whole(self) -> bool:
         """Whether every run of the row came through."""
         return self.count("ok") == len(self.runs)

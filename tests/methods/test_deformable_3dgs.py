@@ -90,6 +90,16 @@ def test_the_published_rates_are_of_one_size_in_the_network_and_quick_heads_lear
     assert growth < shift == turn < layers
 
 
+@pytest.mark.parametrize(("steps", "positions", "network"), [(20_000, 8e-4 * 0.01 ** (2 / 3), 8e-4 * 0.002**0.5),
+                                                             (40_000, 8e-6, 1.6e-6)])  # fmt: skip
+def test_published_rates_fall_by_steps_so_that_fits_of_real_scenes_end_before_they_do(
+    steps: int, positions: float, network: float
+) -> None:
+    found = rates(Settings.preset("paper", {"iterations": steps}), 5.0)
+    assert found["positions"].at(1.0) == pytest.approx(positions)
+    assert found["deformation.layers"].at(1.0) == pytest.approx(network)
+
+
 def test_positions_get_no_gradient_through_the_network() -> None:
     model = DeformableModel(4, 0, 4, 16)
     with torch.no_grad():

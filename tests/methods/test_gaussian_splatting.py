@@ -19,7 +19,7 @@ from torch import nn
 
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, Scene
-from splashbench.synth.balls import ball_centers
+from splashbench.synth.balls import ball_centers, write_balls_scene
 
 
 @pytest.fixture(autouse=True)
@@ -103,6 +103,23 @@ class Table(DynamicModel):
         colors = torch.full((len(self.positions), 3), 0.5)
         factors = ellipsoids(self.log_scales, self.quaternions)
         return Splats(self.positions, factors, torch.sigmoid(self.opacity_logits), colors)
+
+
+class Flying(Table):
+    """Gaussians in the middle of the balls, at any time."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(ball_centers(scene.times[0]))
+        self.first, self.length = float(scene.times[0]), float(scene.times[-1] - scene.times[0])
+
+    def means(self, time: float) -> torch.Tensor:
+        return torch.tensor(ball_centers(self.first + time * self.length), dtype=torch.float32)
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """A scene two of whose cameras are late and early, by which balls move as far as they are large."""
+    return write_balls_scene(tmp_path_factory.mktemp("late") / "balls", n_frames=4, delays={"2": 0.06, "4": -0.06})
 
 
 ROWS = ("positions", "log_scales", "quaternions", "opacity_logits")
@@ -278,6 +295,12 @@ class TestPhotographs:
         np.testing.assert_allclose(np.diff(shares) / np.diff(scene.times), 1 / (scene.times[-1] - scene.times[0]))
         assert np.ptp(np.diff(shares)) > 0.01  # the steps of this scene are uneven
 
+    def test_a_photograph_has_its_cameras_own_time(self, late: Scene) -> None:
+        photographs = Photographs(late.training(), 1000, 1, np.random.default_rng(0))
+        for name, delay in (("1", 0.0), ("2", 0.06), ("4", -0.06)):
+            wanted = (late.times[2] + delay - late.times[0]) / (late.times[-1] - late.times[0])
+            assert photographs.photograph(name, 2).time == pytest.approx(wanted)
+
 
 class TestStart:
     def test_hull_points_lie_on_the_balls_of_their_frame(self, balls: Scene) -> None:
@@ -306,11 +329,14 @@ class TestStart:
         assert np.median(colors[:, 2] - colors[:, 0]) > 0.2  # the balls are blue
 
 
+FLOOR = (0.1, 0.12, 0.25)
+
+
 class TestLiquid:
     @pytest.fixture
     def fitted(self, balls: Scene) -> MixedFitted:
-        """Gaussians at the balls of the first frame, and some on the floor below."""
-        balls_, floor = ball_centers(balls.times[0]), np.array([[0.3, -0.3, 0.3], [-0.4, -0.3, 0.2]])
+        """Gaussians at the balls of the first frame, and some beside and below them."""
+        balls_, floor = ball_centers(balls.times[0]), np.array([FLOOR, [-0.4, -0.3, 0.2]])
         return MixedFitted(Table(np.concatenate([balls_, floor]), opacity=0.95), balls.training())
 
     def test_it_is_what_lies_inside_all_silhouettes(self, fitted: MixedFitted) -> None:
@@ -323,13 +349,20 @@ class TestLiquid:
     def test_opacity_is_of_the_liquid_alone(self, fitted: MixedFitted, balls: Scene) -> None:
         camera = balls.cameras[balls.test[0]]
         render = fitted.render(camera, float(balls.times[0]))
-        (floor,), _ = camera.project(np.array([[0.3, -0.3, 0.3]]))
+        (floor,), _ = camera.project(np.array([FLOOR]))
         column, row = floor.astype(int)
-        if 0 <= column < camera.width and 0 <= row < camera.height:
-            assert render.rgb[row, column].mean() > 0.2
-            assert render.alpha[row, column] < 0.05
+        assert 2 <= column < camera.width - 2
+        assert 2 <= row < camera.height - 2
+        assert render.rgb[row, column].mean() > 0.2  # it is drawn
+        assert render.alpha[row, column] < 0.05
         (ball,), _ = camera.project(ball_centers(balls.times[0])[:1])
         assert render.alpha[int(ball[1]), int(ball[0])] > 0.8
+
+    def test_silhouettes_are_of_their_cameras_own_times(self, late: Scene) -> None:
+        training = late.training()
+        assert MixedFitted(Flying(late), training).liquid(2).all()
+        training.camera_times = dict.fromkeys(late.cameras, late.times)  # as if all had exposed together
+        assert not MixedFitted(Flying(late), training).liquid(2).all()
 
 
 def test_the_gain_of_the_last_quarter_is_told() -> None:

@@ -34,6 +34,7 @@ from splashbench.observe import initial_points
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, Scene
 from splashbench.scene.exporting import export_scene
+from splashbench.submission import Submission
 from splashbench.synth.balls import write_balls_scene
 
 
@@ -286,6 +287,21 @@ class TestSpacetime:
             got = fitted.render(camera, float(late.camera_times["7"][t])).rgb
             assert_same_image(got, wanted)
 
+    def test_behind_a_lite_model_there_may_be_white(self, balls: Scene, tmp_path: Path) -> None:
+        rng = np.random.default_rng(2)
+        rows = rows_of(layouts.LITE, rng, trbf_center=rng.uniform(0, 1, 6))
+        fitted = self.model(tmp_path / "trained", balls, rows, white_background=True)
+        camera = balls.cameras["7"]
+        gaussians = [reference.spacetime_at(row, 2 / 8) for row in named(layouts.LITE, rows)]
+        wanted = np.clip(reference.draw(gaussians, lens_of(camera), background=1.0), 0, 1)
+        assert_same_image(fitted.render(camera, float(balls.camera_times["7"][2])).rgb, wanted)
+        assert_same_when_loaded(OfficialSpacetimeGaussians(), fitted, balls, tmp_path / "kept")
+
+    def test_white_behind_a_full_model_is_refused(self, balls: Scene, tmp_path: Path) -> None:
+        rng = np.random.default_rng(6)
+        with pytest.raises(SplashbenchError, match=r"cfg_args: white_background, .*; train without it"):
+            self.model(tmp_path, balls, rows_of(layouts.FULL, rng), self.decoder(rng), white_background=True)
+
     def test_a_middle_cy_takes_cx_with_it(self, balls: Scene, tmp_path: Path) -> None:
         fitted = self.model(tmp_path, balls, rows_of(layouts.LITE, np.random.default_rng(3)))
         camera = balls.cameras["6"]
@@ -451,7 +467,7 @@ def test_the_command_trains_imports_checks_and_scores(tmp_path: Path, capsys: py
     layouts.write_deformable(tmp_path / "trained", rows, network)
     command = shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(tmp_path / "trained")])
     out = tmp_path / "submission"
-    arguments = ["run", "external", str(balls.directory), str(out), "--name", "theirs", "--mixed"]
+    arguments = ["run", "external", str(balls.directory), str(out), "--name", "theirs"]
     arguments += ["--format", "nerfies", "--command", command, "--import", "deformable_3dgs"]
     arguments += ["--points", str(POINTS), "--timing-frames", "1", "--json"]
     assert main(arguments) == 0
@@ -462,12 +478,39 @@ def test_the_command_trains_imports_checks_and_scores(tmp_path: Path, capsys: py
     (result,) = json.loads(capsys.readouterr().out)["results"]
     assert result["metrics"]["psnr"] > 5
     assert result["metrics"]["primitives_per_frame"] == 40
+    assert Submission.open(out).identity.mixed  # the importer says so
     # The picture that was scored is the one of the published formulas.
     share = (balls.times[1] - balls.times[0]) / (balls.times[-1] - balls.times[0])
     box = read_json(nerfies / "scene.json")
     wanted = TestDeformable().expected(np.float32(rows), network, balls.cameras["7"], float(share), box)
     got = read_image(out / "renders" / "7" / "000001.png") / 255
     assert_same_image(got, np.round(wanted * 255) / 255, 1.01 / 255)
+
+
+@pytest.mark.parametrize(("importer", "layout"), [("spacetime_gaussians", "colmap"), ("scaffold_4d", "blender")])
+def test_the_other_codes_take_the_same_road(
+    importer: str, layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    balls, rng = write_balls_scene(tmp_path / "balls", n_frames=3), np.random.default_rng(0)
+    if importer == "spacetime_gaussians":
+        layouts.write_spacetime(tmp_path / "trained", rows_of(layouts.LITE, rng, 40), None, duration=3)
+    else:
+        export_scene(balls, tmp_path / "seen", "blender", initial_points(balls, POINTS), test_images="blank")
+        layouts.write_scaffold(tmp_path / "trained", TestScaffold().rows(rng), layouts.scaffold_heads(rng))
+    command = shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(tmp_path / "trained")])
+    out = tmp_path / "submission"
+    arguments = ["run", "external", str(balls.directory), str(out), "--name", "theirs", "--format", layout]
+    arguments += ["--command", command, "--import", importer, "--points", str(POINTS), "--blank-test-images"]
+    assert main([*arguments, "--timing-frames", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "ok"
+    assert main(["check", str(out), "--scene", str(balls.directory)]) == 0
+    capsys.readouterr()
+    assert main(["score", str(out), "--scene", str(balls.directory), "--out", str(tmp_path / "r"), "--json"]) == 0
+    (result,) = json.loads(capsys.readouterr().out)["results"]
+    assert result["metrics"]["psnr"] > 5
+    assert Submission.open(out).identity.mixed
+    picture = read_image(out / "renders" / "7" / "000001.png")
+    assert picture.std() > 5  # something is drawn
 
 
 def _cloud(out: Path) -> Path:

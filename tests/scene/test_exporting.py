@@ -17,7 +17,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, write_json
 from splashbench.observe import initial_points
 from splashbench.scene import Scene
-from splashbench.scene.exporting import FORMATS, InitialPoints, export_scene
+from splashbench.scene.exporting import FORMATS, InitialPoints, export_scene, remarks
 from splashbench.synth.balls import _RADII, ball_centers, write_balls_scene
 
 #: Known points about the liquid, on no axis of anything.
@@ -322,3 +322,16 @@ def test_the_command_says_what_was_written_and_what_to_know(
     with pytest.raises(SystemExit) as stop:
         main([*arguments, "--format", "blender", "--with-test-images", "--blank-test-images"])
     assert stop.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("layout", "said"),
+    [
+        ("nerfies", "Deformable-3DGS ignores them"), ("blender", "4D-Scaffold-GS reads them"),
+        ("colmap", "its loader colmap puts them in the middle"), ("nerfstudio", None),
+    ],
+)  # fmt: skip
+def test_what_becomes_of_principal_points_is_said_by_format(balls: Scene, layout: str, said: str | None) -> None:
+    (told,) = [note for note in remarks(balls, layout, Path("NeRF", "x")) if "principal points" in note] or [None]
+    assert (told is None) == (said is None)
+    assert said is None or said in told

@@ -11,6 +11,7 @@ import pytest
 
 from splashbench.files import read_json, write_model
 from splashbench.score import METRICS, PROTOCOL_V1, Result
+from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
 from splashbench.score.result import Digests, metric_value
 from splashbench.study.job import Entry, Store
 from splashbench.study.markdown import to_markdown
@@ -59,13 +60,18 @@ def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
 @pytest.fixture
 def store(plan: Plan, tmp_path: Path) -> Store:
     """The folder of a study with every run made; one crashed."""
-    store = Store(tmp_path)
+    return _made(plan, tmp_path)
+
+
+def _made(plan: Plan, directory: Path, mixed: str = "") -> Store:
+    """mixed: the variant that is said to be of a mixed method."""
+    store = Store(directory)
     for run in plan.runs:
-        _put(store, run, PSNR[run.variant.name][run.scene.name][run.seed])
+        _put(store, run, PSNR[run.variant.name][run.scene.name][run.seed], run.variant.name == mixed)
     return store
 
 
-def _put(store: Store, run: Planned, psnr: float | None) -> None:
+def _put(store: Store, run: Planned, psnr: float | None, mixed: bool) -> None:
     values = {"psnr": psnr, "sigma_d": 30.0, "mu_d": 120.0, "dynamic_bytes": 2_500_000.0, "fit_seconds": 60.0}
     if run.scene.name == "b":
         values["delta_e"] = 0.3  # scene a lacks what it needs
@@ -83,6 +89,7 @@ def _put(store: Store, run: Planned, psnr: float | None) -> None:
         digests=Digests(scene="0" * 64, submission=hashlib.sha256(run.digest.encode()).hexdigest(), protocol="0" * 64),
         metrics={name: metric_value(name, values.get(name), f"no {name}") for name in METRICS},
         hardware={"cpu": "test processor", "cores": 2},
+        mixed=mixed,
     )
     entry = Entry(
         digest=run.digest,
@@ -183,6 +190,32 @@ def test_csv_and_json_hold_the_same_figures(table: Table, tmp_path: Path) -> Non
     assert {run["reused_seconds"] for run in runs} == {"40"}
     (failed,) = [run for run in runs if run["status"] != "ok"]
     assert (failed["variant"], failed["seed"], failed["psnr"], failed["reason"]) == ("per_frame", "1", "", "it | broke")
+
+
+def test_figures_of_mixed_methods_that_rest_on_the_filter_are_marked(plan: Plan, tmp_path: Path) -> None:
+    table = make_table(plan, _made(plan, tmp_path / "store", mixed="dark"))
+    text = to_markdown(table, COMMAND)
+    assert FILTER_NOTE in text
+    figures, differences = (
+        next(line for line in part.splitlines() if line.startswith("| dark"))
+        for part in (text, text.split("## Difference to")[1])
+    )
+    for line in (figures, differences):
+        # Delta E and sigma_D over mu_D are of particles; PSNR, storage and time are not.
+        cells = [cell.strip() for cell in line.strip(" |").split("|")]
+        assert [FILTER_MARK in cell for cell in cells] == [False, False, False, True, True, False, False]
+    assert FILTER_MARK not in next(line for line in text.splitlines() if line.startswith("| full"))
+    files = write_report(table, tmp_path / "report", COMMAND)
+    assert FILTER_NOTE[:20] in files[-1].read_text()
+    assert [row["mixed"] for row in csv.DictReader(io.StringIO(table_csv(table)))] == ["false", "true", "false"]
+    said = read_json(tmp_path / "report" / "table.json")
+    assert [row["mixed"] for row in said["rows"]] == [False, True, False]
+    assert {name for name, facts in said["metrics"].items() if facts["filtered"]} == {"delta_e", "sigma_mu_ratio"}
+
+
+def test_no_mark_stands_where_no_method_is_mixed(table: Table, tmp_path: Path) -> None:
+    assert FILTER_MARK not in to_markdown(table, COMMAND)
+    assert FILTER_NOTE[:20] not in write_report(table, tmp_path / "report", COMMAND)[-1].read_text()
 
 
 def test_the_chart_depends_on_the_results_alone(table: Table, tmp_path: Path) -> None:

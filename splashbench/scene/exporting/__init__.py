@@ -28,6 +28,12 @@ FORMATS: dict[str, Callable[[Export], None]] = {
 _UNEVEN = 0.02
 _PIXEL = 0.01
 _OFF_CENTRE = 1.0
+# What readers of a format make of principal points.
+_ON_PRINCIPAL_POINTS = {
+    "nerfies": "Deformable-3DGS ignores them, and renders as if they were in the middle",
+    "blender": "4D-Scaffold-GS reads them; Deformable-3DGS renders as if they were in the middle",
+    "colmap": "SpacetimeGaussians keeps them with its loader technicolor, its loader colmap puts them in the middle",
+}
 
 
 def export_scene(
@@ -89,11 +95,8 @@ def remarks(scene: Scene, format_name: str, out: Path) -> list[str]:
         float(np.hypot(camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2))
         for camera in scene.cameras.values()
     )
-    if off > _OFF_CENTRE and format_name in ("nerfies", "blender"):
-        found.append(
-            f"principal points lie up to {off:.1f} pixels off the middle; Deformable-3DGS ignores them, and renders as "
-            "if they were in the middle"
-        )
+    if off > _OFF_CENTRE and format_name in _ON_PRINCIPAL_POINTS:
+        found.append(f"principal points lie up to {off:.1f} pixels off the middle; {_ON_PRINCIPAL_POINTS[format_name]}")
     if format_name == "nerfies" and not Path(out).resolve().parent.name.startswith("NeRF"):
         found.append("Deformable-3DGS reads this layout only from a folder whose parent's name begins with NeRF")
     return found

@@ -1,0 +1,50 @@
+"""What every baseline of the paper keeps to: masks stay out of the fit, `paper` runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splashbench import toml
+from splashbench.adapter.contract import Fitted, Run
+from splashbench.adapter.discovery import load_method
+from splashbench.scene import Scene, TrainingScene
+
+SMALL = toml.load(Path(__file__).with_name("small_fits.toml"))
+BASELINES = ("deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d")
+
+
+def fit(name: str, scene: TrainingScene, directory: Path, preset: str = "quick", run: Run | None = None) -> Fitted:
+    method = load_method(name)
+    config = method.Config.preset(preset, {**SMALL[name], "iterations": 12})
+    return method.fit(scene, config, run or Run(directory=directory))
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_masks_give_the_first_points_and_are_not_looked_at_again(name: str, balls: Scene, tmp_path: Path) -> None:
+    training = balls.training()
+    read, told = training.mask, []
+
+    def mask(camera: str, t: int) -> np.ndarray:
+        assert not any(message.startswith("fitting") for message in told), "a mask was read during the fit"
+        return read(camera, t)
+
+    training.mask = mask  # type: ignore[method-assign]
+    run = Run(directory=tmp_path, _report=lambda share, message: told.append(message))
+    fit(name, training, tmp_path, run=run)
+    assert any(message.startswith("fitting") for message in told)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_preset_paper_fits(name: str, balls: Scene, tmp_path: Path) -> None:
+    """The published settings, but for the steps and the numbers of points."""
+    fitted: Any = fit(name, balls.training(), tmp_path, "paper")
+    assert len(fitted.history.psnr) == 12
+    assert fitted.history.psnr[-3:].mean() > fitted.history.psnr[:3].mean()
+    image = fitted.render(balls.cameras["6"], float(balls.times[2])).rgb
+    assert image.shape == (64, 96, 3)
+    assert np.isfinite(image).all()
+    assert image.std() > 0.02
