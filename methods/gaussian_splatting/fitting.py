@@ -97,7 +97,9 @@ def fit_dynamic(
         assert total is not None
         loss = total / len(views)
         if not math.isfinite(float(loss.detach())):
-            raise SplashbenchError(f"the loss is {float(loss.detach())} at iteration {step + 1}; lower the rates")
+            raise SplashbenchError(
+                f"the loss is {float(loss.detach())} at iteration {step + 1}; lower the rates, by rate_factor"
+            )
         loss.backward()
         if density.wants_gradients(step):
             for camera, splats, _ in seen:

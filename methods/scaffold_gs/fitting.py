@@ -6,6 +6,7 @@ the first steps see smaller images (a step's cost is mostly that of its pixels),
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -19,6 +20,7 @@ from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 from splashbench_methods.scaffold_gs.plate import Plate, shrunk
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
+from splashbench.errors import SplashbenchError
 from splashbench.render import rasterize
 from splashbench.render.ssim import SsimTarget, ssim
 
@@ -77,7 +79,10 @@ def fit_model(
     random_seed: int,
     progress: Callable[[float], None],
 ) -> AnchorModel:
-    """Optimise a model that starts at `seed`; `progress` hears the fraction done. `plates` show something each."""
+    """Optimise a model that starts at `seed`; `progress` hears the fraction done. `plates` show something each.
+
+    Raises SplashbenchError where the loss stops being finite.
+    """
     rng = np.random.default_rng(random_seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(random_seed)
@@ -104,6 +109,11 @@ def fit_model(
             drawn = opacities.detach() > 0
             volumes = (scales / unit).prod(dim=1) * drawn
             loss = loss + _VOLUME_WEIGHT * volumes.sum() / drawn.sum().clamp(min=1)
+            if not math.isfinite(float(loss.detach())):
+                raise SplashbenchError(
+                    f"the background's loss is {float(loss.detach())} at iteration {iteration + 1}; see that the "
+                    "scene's images and cameras are right, or give another seed"
+                )
             growing = grow_from <= iteration < grow_until
             if growing:
                 means.retain_grad()

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splashbench_methods.gaussian_splatting import fitting
+from splashbench_methods.scaffold_gs import fitting as background_fitting
 
 from splashbench import toml
 from splashbench.adapter.contract import Fitted, Run
 from splashbench.adapter.discovery import load_method
+from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene, TrainingScene
 
 SMALL = toml.load(Path(__file__).with_name("small_fits.toml"))
@@ -48,3 +51,14 @@ def test_preset_paper_fits(name: str, balls: Scene, tmp_path: Path) -> None:
     assert image.shape == (64, 96, 3)
     assert np.isfinite(image).all()
     assert image.std() > 0.02
+
+
+def test_a_loss_that_stops_being_finite_ends_the_fit_with_a_remedy(
+    balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (fitting, background_fitting):
+        monkeypatch.setattr(module, "l1", lambda image, *rest: image.sum() * float("nan"))
+    with pytest.raises(SplashbenchError, match="the loss is nan at iteration 1; lower the rates, by rate_factor"):
+        fit("spacetime_gaussians_lite", balls.training(), tmp_path)
+    with pytest.raises(SplashbenchError, match="the background's loss is nan at iteration 1; see that"):
+        fit("scaffold_gs", balls.training(), tmp_path)
