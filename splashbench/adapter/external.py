@@ -61,9 +61,10 @@ def run_external(
     if work is not None:
         _require_apart(work, out, scene_directory)
     scene = Scene.open(scene_directory)
+    inputs = [scene_directory, *([code.trained] if code.trained is not None else [])]
     identity = _identity(code, scene, preset or PRESET, seed, device)
     with (
-        atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene_directory]) as staging,
+        atomic_directory(out, replace=replace, holds=IDENTITY, inputs=inputs) as staging,
         _workplace(work) as scratch,
     ):
         run = ExternalRun(code, scene, scratch, staging, seed, device, timeout_seconds)
@@ -90,7 +91,14 @@ def _require_runnable(code: ExternalCode) -> None:
         raise SplashbenchError("a render command and an importer are two ways to the same renders; give one of them")
     if not code.directory.is_dir():
         raise SplashbenchError(f"{code.directory} is not a folder; give the one that the commands are to run in")
-    require_command("--command", code.command, code.shell, code.directory)
+    if code.trained is None:
+        require_command("--command", code.command, code.shell, code.directory)
+    elif code.command:
+        raise SplashbenchError("--command and --trained are two ways to the same model; give one of them")
+    elif not code.trained.is_dir():
+        raise SplashbenchError(f"{code.trained} is not a folder; give the one that the code left its model in")
+    elif not (code.importer or code.render_command):
+        raise SplashbenchError("--trained needs --import or --render-command: something has to read the model")
     if code.render_command:
         require_command("--render-command", code.render_command, code.shell, code.directory)
     if code.importer:
@@ -104,7 +112,8 @@ def _require_runnable(code: ExternalCode) -> None:
 
 def _identity(code: ExternalCode, scene: Scene, preset: str, seed: int, device: str) -> Identity:
     settings = {
-        "command": code.command,
+        "command": code.command or None,
+        "trained": True if code.trained is not None else None,
         "render_command": code.render_command,
         "importer": code.importer,
         "format": code.format,

@@ -34,7 +34,9 @@ class ExternalCode:
     Attributes:
         name, version, mixed: what the submission says of the method (docs/submission_format.md).
         format: of the export it trains on, one of scene.exporting.FORMATS.
-        command: fits the scene; placeholders are those of commands.PLACEHOLDERS.
+        command: fits the scene; placeholders are those of commands.PLACEHOLDERS. "" with `trained`.
+        trained: a folder that the command left as `{out}` on an earlier day, for an importer or `render_command` to
+            read; the fit is then not measured. None where `command` is run.
         render_command: writes the test views; None where `command` does, or where an importer reads its output.
         importer: an importer's name, or None.
         shell: whether the commands are for /bin/sh, with pipes and variables, rather than a program and arguments.
@@ -45,6 +47,7 @@ class ExternalCode:
     name: str
     command: str
     format: str
+    trained: Path | None = None
     version: str = "1"
     mixed: bool = False
     render_command: str | None = None
@@ -83,7 +86,9 @@ class ExternalRun:
 
     @property
     def output(self) -> Path:
-        """Where the code leaves its model."""
+        """Where the code leaves its model, or left it once. An importer only reads there."""
+        if self.code.trained is not None and self.code.importer:
+            return self.code.trained.resolve()
         return self.scratch / "out"
 
     @property
@@ -96,7 +101,7 @@ class ExternalRun:
         from splashbench.observe import initial_points
 
         for folder in (self.output, self.into):
-            folder.mkdir()
+            folder.mkdir(exist_ok=folder == self.output and self.code.trained is not None)
         facts = export_scene(
             self.scene,
             self.exported,
@@ -118,9 +123,13 @@ class ExternalRun:
         }
 
     def fit(self) -> None:
-        """Run the command that fits, and measure it."""
-        watched = self._command("fit", self.code.command)
-        self._note(fit_seconds=watched.seconds, **_storage(self.output))
+        """Run the command that fits, and measure it; or take over what it left once."""
+        if self.code.trained is None:
+            watched = self._command("fit", self.code.command)
+            self._note(fit_seconds=watched.seconds)
+        elif not self.code.importer:
+            _copy_plain(self.code.trained, self.output)  # the command that renders may write there
+        self._note(**_storage(self.output))
 
     def render(self) -> None:
         """Run the command that renders, where it is another."""
@@ -203,6 +212,8 @@ class ExternalRun:
 
     def _watched(self, watched: Watched) -> None:
         self.log_tail = watched.log_tail
+        if self.code.trained is not None:
+            return  # a rendering's memory would pass for the fit's
         self._note(peak_memory_bytes=max(self.record.peak_memory_bytes or 0, watched.peak_memory_bytes))
 
     def _note(self, **measured: Any) -> None:

@@ -18,6 +18,7 @@ NAME = "external"
 _OWN = {
     "name": None,
     "fit_command": None,
+    "trained": None,
     "format": None,
     "render_command": None,
     "importer": None,
@@ -43,6 +44,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--name", help="what the method is called in the submission")
     group.add_argument(
         "--command", dest="fit_command", metavar="COMMAND", help="fits the scene; clocked, and its memory measured"
+    )
+    group.add_argument(
+        "--trained",
+        type=Path,
+        metavar="DIR",
+        help="instead of --command: what it left as {out} earlier, trained on this scene as `scene export` with the "
+        "same --format and --points wrote it; no fit time is recorded",
     )
     group.add_argument("--format", choices=("nerfies", "nerfstudio", "blender", "colmap"), help="of the exported scene")
     group.add_argument(
@@ -70,9 +78,13 @@ def fault(arguments: argparse.Namespace) -> str | None:
             if getattr(arguments, name) != default:
                 return f"{_option(name)} is for METHOD external alone"
         return None
-    for name in ("name", "fit_command", "format"):
+    for name in ("name", "format"):
         if getattr(arguments, name) is None:
             return f"METHOD external needs {_option(name)}"
+    if (arguments.fit_command is None) == (arguments.trained is None):
+        return "METHOD external needs --command, or --trained where the model is there already"
+    if arguments.trained is not None and not (arguments.importer or arguments.render_command):
+        return "--trained needs --import or --render-command: something has to read the model"
     if arguments.overrides:
         return "--set is for methods with settings; an external code's are in its commands"
     if arguments.render_command and arguments.importer:
@@ -100,7 +112,8 @@ def run(arguments: argparse.Namespace) -> Submission:
         say(f"note: {note}")
     code = ExternalCode(
         name=arguments.name,
-        command=arguments.fit_command,
+        command=arguments.fit_command or "",
+        trained=arguments.trained,
         format=arguments.format,
         version=arguments.method_version or "1",
         mixed=arguments.mixed,

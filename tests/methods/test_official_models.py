@@ -513,6 +513,34 @@ def test_the_other_codes_take_the_same_road(
     assert picture.std() > 5  # something is drawn
 
 
+def test_a_model_that_was_trained_before_is_imported_without_a_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    balls = write_balls_scene(tmp_path / "balls", n_frames=3)
+    layouts.write_spacetime(tmp_path / "trained", rows_of(layouts.LITE, np.random.default_rng(0), 40), None, duration=3)
+    command = shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(tmp_path / "trained")])
+    common = ["--name", "theirs", "--format", "colmap", "--import", "spacetime_gaussians", "--points", str(POINTS)]
+    submissions = []
+    for name, how in (("run", ["--command", command]), ("taken", ["--trained", str(tmp_path / "trained")])):
+        out = tmp_path / name
+        assert main(["run", "external", str(balls.directory), str(out), *common, *how, "--timing-frames", "1"]) == 0
+        submissions.append(Submission.open(out))
+    run, taken = submissions
+    for path in sorted((tmp_path / "run" / "renders").rglob("*.png")):
+        other = tmp_path / "taken" / path.relative_to(tmp_path / "run")
+        assert path.read_bytes() == other.read_bytes()
+    assert run.record.fit_seconds is not None
+    assert (taken.record.fit_seconds, taken.record.peak_memory_bytes) == (None, None)
+    assert taken.record.storage_bytes == run.record.storage_bytes
+    assert taken.identity.settings["trained"] is True
+    assert str(tmp_path) not in (tmp_path / "taken" / "submission.toml").read_text()
+    capsys.readouterr()
+    for how, said in ((tmp_path / "none", "is not a folder; give the one that the code left its model in"),
+                      (tmp_path / "balls", "let the code save its last iteration")):  # fmt: skip
+        assert main(["run", "external", str(balls.directory), str(tmp_path / "x"), *common, "--trained", str(how)]) == 1
+        assert said in capsys.readouterr().err
+
+
 def _cloud(out: Path) -> Path:
     return out / "point_cloud/iteration_20000/point_cloud.ply"
 
