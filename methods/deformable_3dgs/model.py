@@ -54,6 +54,7 @@ class DeformableModel(DynamicModel):
     def from_start(cls, start: Start, opacity: float, sh_degree: int, depth: int, width: int) -> DeformableModel:
         """A model about to be fitted; the network's weights come from torch's generator."""
         model = cls(len(start), sh_degree, depth, width)
+        model.backdrop = start.backdrop_tensor()
         with torch.no_grad():
             model.positions.copy_(torch.from_numpy(start.positions))
             model.log_scales.copy_(torch.from_numpy(start.spacing).log()[:, None].expand(-1, 3))

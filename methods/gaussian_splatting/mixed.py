@@ -108,6 +108,8 @@ class MixedFitted(Fitted):
 
     def save(self, directory: Path) -> None:
         arrays = {name: tensor.detach().numpy() for name, tensor in self.model.state_dict().items()}
+        if self.model.backdrop is not None:
+            arrays["backdrop"] = self.model.backdrop.numpy()
         with atomic_path(directory / MODEL_FILE) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **arrays)
         if self.history is not None:
@@ -126,12 +128,16 @@ def load_tables(model_file: Path, model: DynamicModel, rows: tuple[str, ...]) ->
     Raises SplashbenchError where the file does not go with the model.
     """
     shapes = {name: tensor.ndim for name, tensor in model.state_dict().items()}
-    arrays = read_npz(model_file, shapes)
+    arrays = read_npz(model_file, shapes, {"backdrop": 1})
     count = len(arrays[rows[0]])
     for name in rows:
         old = getattr(model, name)
         blank = torch.zeros(count, *old.shape[1:])
         setattr(model, name, torch.nn.Parameter(blank) if isinstance(old, torch.nn.Parameter) else blank)
+    if "backdrop" in arrays:
+        if arrays["backdrop"].shape != (3,):
+            raise SplashbenchError(f"{model_file}: the backdrop is no colour; fit again")
+        model.backdrop = torch.from_numpy(arrays["backdrop"].astype(np.float32))
     try:
         model.load_state_dict({name: torch.from_numpy(arrays[name]) for name in shapes})
     except RuntimeError as error:

@@ -30,7 +30,12 @@ class Splats:
 
 
 class DynamicModel(nn.Module, ABC):
-    """A scene of Gaussians in motion. Times run from 0 to 1 over the recording."""
+    """A scene of Gaussians in motion. Times run from 0 to 1 over the recording.
+
+    backdrop: colour [3] in [0, 1] that lies behind everything; None for black.
+    """
+
+    backdrop: Tensor | None = None
 
     def at(self, time: float) -> Any:
         """What all views of one instant share, such as a network's output; it is handed to `splats`."""
@@ -49,9 +54,16 @@ class DynamicModel(nn.Module, ABC):
         """Colours [H, W, 3] of what was rasterized [H, W, C]; as it is, unless a network decodes it."""
         return rendered
 
+    def channels_behind(self, backdrop: Tensor) -> Tensor:
+        """What is to be rasterized behind all Gaussians, [C], so that `image` makes the colour `backdrop` [3] of it."""
+        return backdrop
+
     def view(self, splats: Splats, camera: Camera, time: float) -> Tensor:
-        """The image [H, W, 3] of `splats` over black; not clipped."""
-        rendered, _ = rasterize(splats.means, splats.factors, splats.opacities, splats.colors, camera)
+        """The image [H, W, 3] of `splats` over the backdrop; not clipped."""
+        behind = None if self.backdrop is None else self.channels_behind(self.backdrop)
+        rendered, _ = rasterize(
+            splats.means, splats.factors, splats.opacities, splats.colors, camera, background=behind
+        )
         return self.image(rendered, camera, time)
 
 

@@ -2,14 +2,15 @@
 
 The paper starts every method from points sampled from the mask-derived hull of the training views (supplement,
 "Baselines"). What is no liquid starts from the scene's sparse points, or from the training views' pixels lifted to
-their depth (scaffold_gs/anchors.py).
+their depth (scaffold_gs/anchors.py). Views that are of one colour throughout, such as those of made-up liquid over
+white, have nothing there whose depth could be told: that colour then lies behind everything, without any points.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -26,6 +27,8 @@ from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import TrainingScene
 
 _PLATE_SIDE = 800
+# Grey levels by which pixels of one colour may differ, as after JPEG.
+_PLAIN = 3
 
 
 @dataclass(frozen=True)
@@ -33,16 +36,21 @@ class Start:
     """Points to start from: positions [N, 3] and spacing [N] in scene units, colors [N, 3] in [0, 1].
 
     spacing: mean distance to the three nearest points of the same instant. frame: [N] timestep of a point of the
-    liquid, -1 for one of the static scene.
+    liquid, -1 for one of the static scene. backdrop: colour [3] in [0, 1] that lies behind everything, or None.
     """
 
     positions: NDArray[np.float32]
     colors: NDArray[np.float32]
     spacing: NDArray[np.float32]
     frame: NDArray[np.int64]
+    backdrop: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def backdrop_tensor(self) -> torch.Tensor | None:
+        """The backdrop as a model takes it."""
+        return None if self.backdrop is None else torch.from_numpy(self.backdrop)
 
 
 class StartSettings(Protocol):
@@ -68,13 +76,21 @@ def started(
         with run.stage("start"):
             static = static_points(scene, settings.static_points, settings.static, rng)
             start = joined(static, hull_points(scene, settings.hull_points, largest_only))
+        if not len(start):
+            raise SplashbenchError(
+                f"{scene.name}: there is nothing to start from, no liquid in any mask and one colour elsewhere; "
+                "correct the masks"
+            )
         yield start, rng
 
 
 def static_points(
     scene: TrainingScene, count: int, source: Literal["pixels", "points"], rng: np.random.Generator
 ) -> Start:
-    """At most `count` points of what is no liquid: lifted pixels, or the scene's sparse points where it has some."""
+    """At most `count` points of what is no liquid: lifted pixels, or the scene's sparse points where it has some.
+
+    None, but a backdrop, where the views show one colour besides the liquid.
+    """
     sparse = scene.initial_points()
     if source == "points" and sparse is not None and len(sparse):
         seed = sparse_anchors(sparse, count)
@@ -83,8 +99,18 @@ def static_points(
         plates = [plate for plate in plates if plate.seen.any()]
         if not plates:
             raise SplashbenchError(f"{scene.name}: the masks cover every training image whole; correct them")
+        backdrop = plain_color(np.concatenate([plate.image[plate.seen] for plate in plates]))
+        if backdrop is not None:
+            return replace(_joined([]), backdrop=backdrop)
         seed = seed_anchors(sparse, plates, count, rng)
     return Start(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
+
+
+def plain_color(pixels: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    """The colour [3] in [0, 1] of `pixels` [n, 3], where they have but one; else None."""
+    color = np.median(pixels, axis=0)
+    plain = bool((np.abs(pixels - color) <= _PLAIN).all())
+    return (color / 255).astype(np.float32) if plain else None
 
 
 def hull_points(scene: TrainingScene, count: int, largest_only: bool = False) -> Start:
@@ -118,7 +144,9 @@ def _joined(parts: list[Start]) -> Start:
         nothing = np.empty((0, 3), np.float32)
         return Start(nothing, nothing, np.empty(0, np.float32), np.empty(0, np.int64))
     names = ("positions", "colors", "spacing", "frame")
-    return Start(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    backdrop = next((part.backdrop for part in parts if part.backdrop is not None), None)
+    tables = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Start(**tables, backdrop=backdrop)
 
 
 def joined(*parts: Start) -> Start:

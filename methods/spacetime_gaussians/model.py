@@ -72,6 +72,7 @@ class SpacetimeModel(DynamicModel):
         model = cls(len(start), full)
         colors, static = torch.from_numpy(start.colors), torch.from_numpy(start.frame < 0)
         own = torch.from_numpy(np.asarray(times, np.float32))[torch.from_numpy(start.frame.clip(min=0))]
+        model.backdrop = start.backdrop_tensor()
         with torch.no_grad():
             model.positions.copy_(torch.from_numpy(start.positions))
             model.log_scales.copy_(torch.from_numpy(start.spacing).log()[:, None].expand(-1, 3))
@@ -116,6 +117,12 @@ class SpacetimeModel(DynamicModel):
 
     def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
         return torch.sigmoid(self.decoded(rendered, camera)) if self.full else rendered
+
+    def channels_behind(self, backdrop: Tensor) -> Tensor:
+        if not self.full:
+            return backdrop
+        # With the features at nought the decoder leaves the logits as they are. .001 is a quarter of a grey level.
+        return torch.cat([torch.logit(backdrop.clamp(0.001, 0.999)), torch.zeros(6)])
 
     def decoded(self, rendered: Tensor, camera: Camera) -> Tensor:
         """Logits [H, W, 3] of the full model's channels [H, W, 9]."""

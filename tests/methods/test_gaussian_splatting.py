@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +15,14 @@ from splashbench_methods.gaussian_splatting.mixed import MixedFitted
 from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
 from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
 from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, ellipsoids
-from splashbench_methods.gaussian_splatting.start import hull_points, joined, static_points
+from splashbench_methods.gaussian_splatting.start import hull_points, joined, plain_color, static_points
 from torch import nn
 
+from splashbench.adapter.contract import Run
+from splashbench.adapter.discovery import load_method
+from splashbench.errors import SplashbenchError
 from splashbench.render.torch_threads import one_torch_thread
-from splashbench.scene import Camera, Scene
+from splashbench.scene import Camera, Scene, TrainingScene
 from splashbench.synth.balls import ball_centers, write_balls_scene
 
 
@@ -330,6 +334,60 @@ class TestStart:
 
 
 FLOOR = (0.1, 0.12, 0.25)
+
+
+class TestPlainViews:
+    """Liquid over one colour, as in made-up recordings: no point has a depth there, so there are none."""
+
+    @pytest.fixture
+    def plain(self, balls: Scene) -> TrainingScene:
+        training = balls.training()
+        noise = np.random.default_rng(0).integers(-2, 3, (64, 96, 3))
+        pictures = {
+            (name, t): np.where(balls.mask(name, t)[..., None], balls.image(name, t), 240 + noise).astype(np.uint8)
+            for name in balls.train
+            for t in range(balls.n_frames)
+        }
+        training.image = lambda name, t: pictures[name, t]  # type: ignore[method-assign]
+        training.initial_points = lambda: None  # type: ignore[method-assign]
+        return training
+
+    def test_the_colour_lies_behind_everything(self, plain: TrainingScene) -> None:
+        start = static_points(plain, 300, "pixels", np.random.default_rng(0))
+        assert len(start) == 0
+        assert start.backdrop is not None
+        np.testing.assert_allclose(start.backdrop, 240 / 255, atol=1e-6)
+        both = joined(start, hull_points(plain, 100))
+        assert len(both) >= 100
+        assert both.backdrop is start.backdrop
+
+    def test_a_scene_with_something_in_it_has_none(self, balls: Scene) -> None:
+        assert static_points(balls.training(), 300, "pixels", np.random.default_rng(0)).backdrop is None
+        gray = np.full((100, 3), 200, np.uint8)
+        assert plain_color(gray) is not None
+        gray[7, 1] += 4
+        assert plain_color(gray) is None
+
+    @pytest.mark.parametrize(
+        "name", ["deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d"]
+    )
+    def test_it_is_drawn_and_kept(self, name: str, plain: TrainingScene, balls: Scene, tmp_path: Path) -> None:
+        method = load_method(name)
+        small = {"iterations": 3, "hull_points": 60, "most": 100}
+        fitted = method.fit(plain, method.Config.preset("quick", small), Run(directory=tmp_path))
+        camera = balls.cameras["6"]
+        image = fitted.render(camera, 0.1).rgb
+        np.testing.assert_allclose(image[:3, :3], 240 / 255, atol=1 / 255)
+        (tmp_path / "model").mkdir()
+        fitted.save(tmp_path / "model")
+        np.testing.assert_array_equal(method.load(tmp_path / "model", plain).render(camera, 0.1).rgb, image)
+
+    def test_nothing_at_all_is_an_error(self, plain: TrainingScene, tmp_path: Path) -> None:
+        plain.image = lambda name, t: np.full((64, 96, 3), 9, np.uint8)  # type: ignore[method-assign]
+        plain.mask = lambda name, t: np.zeros((64, 96), bool)  # type: ignore[method-assign]
+        method = load_method("scaffold_4d")
+        with pytest.raises(SplashbenchError, match=r"there is nothing to start from, .*; correct the masks"):
+            method.fit(plain, method.Config.preset("quick", {}), Run(directory=tmp_path))
 
 
 class TestLiquid:
