@@ -21,8 +21,8 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 6000, "views_per_step": 1, "hull_points": 40_000, "most": 60_000, "rate_factor": 3.0,
-            "color_factor": 4.0, "new_times": "kept",
+            "iterations": 6000, "views_per_step": 1, "hull_points": 40_000, "most": 60_000, "rate_factor": 1.5,
+            "color_factor": 2.0, "new_times": "kept", "start_opacity": 0.1,
         },
         "paper": {
             "iterations": 30_000, "views_per_step": 2, "static": "points", "static_points": 100_000,

@@ -335,3 +335,16 @@ def test_what_becomes_of_principal_points_is_said_by_format(balls: Scene, layout
     (told,) = [note for note in remarks(balls, layout, Path("NeRF", "x")) if "principal points" in note] or [None]
     assert (told is None) == (said is None)
     assert said is None or said in told
+
+
+@pytest.mark.parametrize(("layout", "most"), [("colmap", 10_000), ("nerfstudio", 100_000)])
+def test_that_static_points_are_left_out_is_said_and_counted(
+    balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, most: int
+) -> None:
+    many = np.random.default_rng(0).uniform(0, 1, (most + 500, 6))
+    monkeypatch.setattr(Scene, "initial_points", lambda self: many)
+    assert f"{most} of the {most + 500} static points are written" in " ".join(remarks(balls, layout, Path("x")))
+    points = InitialPoints(many, tuple(np.zeros((0, 6)) for _ in range(balls.n_frames)))
+    assert export_scene(balls, tmp_path / "out", layout, points).static_points == most
+    monkeypatch.setattr(Scene, "initial_points", lambda self: many[:most])
+    assert "static points" not in " ".join(remarks(balls, layout, Path("x")))

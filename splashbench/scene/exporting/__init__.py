@@ -10,7 +10,7 @@ import numpy as np
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, write_model
 from splashbench.scene.exporting.colmap import nearest_rotation, write_colmap
-from splashbench.scene.exporting.export import Clock, Export, InitialPoints, TestImages
+from splashbench.scene.exporting.export import Clock, Export, InitialPoints, TestImages, most_static
 from splashbench.scene.exporting.nerfies import write_nerfies
 from splashbench.scene.exporting.records import FACTS, TEST_VIEWS, Facts, WantedViews, facts
 from splashbench.scene.exporting.transforms import write_blender, write_nerfstudio
@@ -74,6 +74,10 @@ def remarks(scene: Scene, format_name: str, out: Path) -> list[str]:
     found = []
     if scene.times_source == "nominal":
         found.append("the scene has no timestamps; times are an order, not seconds")
+    static, most = scene.initial_points(), most_static(format_name)
+    if static is not None and len(static) > most:
+        each = " in each timestep" if format_name == "colmap" else ""
+        found.append(f"{most} of the {len(static)} static points are written{each}, evenly chosen")
     if format_name == "colmap":
         steps = np.diff(np.stack([scene.camera_times[name] for name in scene.cameras]), axis=1)
         uneven = float(np.abs(steps / steps.mean() - 1).max()) if steps.size else 0.0

@@ -27,6 +27,12 @@ TestImages = Literal["none", "blank", "true"]
 MAX_STATIC = 100_000
 MAX_STATIC_PER_FRAME = 10_000
 
+
+def most_static(format_name: str) -> int:
+    """Static points at most, in the export or, of `colmap`, in each of its timesteps."""
+    return MAX_STATIC_PER_FRAME if format_name == "colmap" else MAX_STATIC
+
+
 # Off-diagonal entries of K, relative to the focal length: beyond rounding, a pinhole of four numbers is another camera.
 _NO_SKEW = 1e-9
 

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from splashbench.scene.camera import Camera
-from splashbench.scene.exporting.export import Export, TestImages
+from splashbench.scene.exporting.export import Export, TestImages, most_static
 
 #: By which an export is told from any other folder.
 FACTS = "splashbench.json"
@@ -111,6 +111,6 @@ def facts(export: Export, format_name: str) -> Facts:
         time_span_seconds=export.clock.span,
         test_images=export.test_images,
         masks=export.masks,
-        static_points=len(export.points.static),
+        static_points=min(len(export.points.static), most_static(format_name)),
         liquid_points=sum(len(points) for points in export.points.liquid),
     )
