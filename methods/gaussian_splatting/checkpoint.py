@@ -56,7 +56,9 @@ def _require_size(path: Path) -> None:
     except (zipfile.BadZipFile, OSError, ValueError, RuntimeError):
         pass  # an older format, or no such file at all: the reader will tell
     if size > _MAX_BYTES:
-        raise SplashbenchError(f"{path} holds more than {_MAX_BYTES >> 20} MiB; these are no weights of such a network")
+        raise SplashbenchError(
+            f"{path} holds more than {_MAX_BYTES >> 20} MiB, too much for it; give the file that the code saved"
+        )
 
 
 def fill(slots: Mapping[str, Tensor], weights: Mapping[str, Tensor], path: Path) -> None:

@@ -73,7 +73,9 @@ def traced_weights(path: Path, max_bytes: int) -> dict[str, NDArray[np.floating]
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
             if sum(sizes.values()) > max_bytes:
-                raise SplashbenchError(f"{path} unpacks to more than {max_bytes >> 20} MiB; these are no such weights")
+                raise SplashbenchError(
+                    f"{path} unpacks to more than {max_bytes >> 20} MiB, too much; give the file that the code saved"
+                )
             program = next(name for name in sizes if name.count("/") == 1 and name.endswith("/data.pkl"))
             if sizes[program] > _MAX_PROGRAM_BYTES:
                 raise SplashbenchError(f"{path}: its list of weights is too long; give the file as the code saved it")
