@@ -57,7 +57,7 @@ def _require_size(path: Path) -> None:
         pass  # an older format, or no such file at all: the reader will tell
     if size > _MAX_BYTES:
         raise SplashbenchError(
-            f"{path} holds more than {_MAX_BYTES >> 20} MiB, too much for it; give the file that the code saved"
+            f"{path} holds more than {_MAX_BYTES >> 20} MiB, more than such a network; see that it is the model's file"
         )
 
 

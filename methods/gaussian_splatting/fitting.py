@@ -98,7 +98,8 @@ def fit_dynamic(
         loss = total / len(views)
         if not math.isfinite(float(loss.detach())):
             raise SplashbenchError(
-                f"the loss is {float(loss.detach())} at iteration {step + 1}; lower the rates, by rate_factor"
+                f"the loss is {float(loss.detach())} at iteration {step + 1}; lower the rates, by rate_factor and what "
+                "other factors of rates the method has"
             )
         loss.backward()
         if density.wants_gradients(step):

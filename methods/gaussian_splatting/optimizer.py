@@ -26,7 +26,8 @@ _BESIDE_MUON = 0.1
 class Rate:
     """A learning rate that falls exponentially from `first` to `last` until the share `until` of the fit.
 
-    hold: share of the fit until which it stays `first`. begin: share before which it is 0.
+    until: over 1 where the fit ends before. hold: share of the fit until which it stays `first`. begin: share before
+    which it is 0.
     """
 
     first: float

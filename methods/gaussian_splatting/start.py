@@ -8,7 +8,7 @@ white, have nothing there whose depth could be told: that colour then lies behin
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
@@ -77,9 +77,9 @@ def started(
             static = static_points(scene, settings.static_points, settings.static, rng)
             start = joined(static, hull_points(scene, settings.hull_points, largest_only))
         if not len(start):
+            remedy = "correct the masks" if settings.hull_points else "raise hull_points"
             raise SplashbenchError(
-                f"{scene.name}: there is nothing to start from, no liquid in any mask and one colour elsewhere; "
-                "correct the masks"
+                f"{scene.name}: there is nothing to start from, no points of liquid and one colour elsewhere; {remedy}"
             )
         yield start, rng
 
@@ -99,17 +99,17 @@ def static_points(
         plates = [plate for plate in plates if plate.seen.any()]
         if not plates:
             raise SplashbenchError(f"{scene.name}: the masks cover every training image whole; correct them")
-        backdrop = plain_color(np.concatenate([plate.image[plate.seen] for plate in plates]))
+        backdrop = plain_color([plate.image[plate.seen] for plate in plates])
         if backdrop is not None:
             return replace(_joined([]), backdrop=backdrop)
         seed = seed_anchors(sparse, plates, count, rng)
     return Start(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
 
 
-def plain_color(pixels: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """The colour [3] in [0, 1] of `pixels` [n, 3], where they have but one; else None."""
-    color = np.median(pixels, axis=0)
-    plain = bool((np.abs(pixels - color) <= _PLAIN).all())
+def plain_color(views: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32] | None:
+    """The colour [3] in [0, 1] of all pixels of `views`, [n, 3] each, where they have but one; else None."""
+    color = np.median(views[0], axis=0).astype(np.int16)
+    plain = all(bool((np.abs(pixels.astype(np.int16) - color) <= _PLAIN).all()) for pixels in views)
     return (color / 255).astype(np.float32) if plain else None
 
 

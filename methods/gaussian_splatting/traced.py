@@ -74,7 +74,7 @@ def traced_weights(path: Path, max_bytes: int) -> dict[str, NDArray[np.floating]
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
             if sum(sizes.values()) > max_bytes:
                 raise SplashbenchError(
-                    f"{path} unpacks to more than {max_bytes >> 20} MiB, too much; give the file that the code saved"
+                    f"{path} unpacks to more than {max_bytes >> 20} MiB, more than such weights; see what file it is"
                 )
             program = next(name for name in sizes if name.count("/") == 1 and name.endswith("/data.pkl"))
             if sizes[program] > _MAX_PROGRAM_BYTES:

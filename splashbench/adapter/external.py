@@ -59,7 +59,7 @@ def run_external(
     """
     _require_runnable(code)
     if work is not None:
-        _require_apart(work, out, scene_directory)
+        _require_apart(work, out, scene_directory, *([code.trained] if code.trained is not None else []))
     scene = Scene.open(scene_directory)
     inputs = [scene_directory, *([code.trained] if code.trained is not None else [])]
     identity = _identity(code, scene, preset or PRESET, seed, device)

@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         help="instead of --command: what it left as {out} earlier, trained on this scene as `scene export` with the "
-        "same --format and --points wrote it; no fit time is recorded",
+        "same --format, --points and --blank-test-images wrote it; no fit time is recorded",
     )
     group.add_argument("--format", choices=("nerfies", "nerfstudio", "blender", "colmap"), help="of the exported scene")
     group.add_argument(
@@ -81,8 +81,10 @@ def fault(arguments: argparse.Namespace) -> str | None:
     for name in ("name", "format"):
         if getattr(arguments, name) is None:
             return f"METHOD external needs {_option(name)}"
-    if (arguments.fit_command is None) == (arguments.trained is None):
+    if arguments.fit_command is None and arguments.trained is None:
         return "METHOD external needs --command, or --trained where the model is there already"
+    if arguments.fit_command is not None and arguments.trained is not None:
+        return "--command and --trained are two ways to the same model; give one"
     if arguments.trained is not None and not (arguments.importer or arguments.render_command):
         return "--trained needs --import or --render-command: something has to read the model"
     if arguments.overrides:

@@ -99,8 +99,7 @@ TRUTH_METRICS = tuple(name for name, metric in METRICS.items() if metric.group =
 FILTER_MARK = "†"
 FILTER_NOTE = (
     f"{FILTER_MARK} One set of primitives is background and liquid. The figure is of those alone that lie inside the "
-    "silhouettes of all training views: a filter of this protocol, no part of the method. It loses liquid that only "
-    "some views see."
+    "silhouettes of all training views: a filter, no part of the method. It loses liquid that only some views see."
 )
 
 

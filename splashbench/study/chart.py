@@ -63,7 +63,7 @@ def draw_chart(table: Table, out: Path) -> list[Path]:
         figure.suptitle(spec.title or f"Study {spec.name}", x=0.01, ha="left", fontsize=11.5, fontweight="bold")
         legend = "Mark: mean over scenes and seeds. Bar: one standard deviation over seeds to either side. Dots: seeds."
         legend += f" Dashed: {spec.baseline}." + (" Hollow: as the paper reports, of other scenes." if reported else "")
-        if any(row.mixed for row in table.rows):
+        if table.filtered:
             legend += "\n" + textwrap.fill(FILTER_NOTE, 190)
         figure.supxlabel(legend, x=0.01, ha="left", fontsize=7.5, color=_GREY)
         paths = [Path(out, "chart.png"), Path(out, "chart.svg")]

@@ -47,7 +47,9 @@ def table_csv(table: Table) -> str:
 def runs_csv(table: Table) -> str:
     """A row per run. reused_seconds: of fit_seconds, what was spent in an earlier run of the study."""
     metrics = table.plan.spec.metrics
-    lines = [["scene", "variant", "seed", "status", "reason", *metrics, "reused_seconds", "runs_at_once", "digest"]]
+    lines = [
+        ["scene", "variant", "seed", "status", "reason", *metrics, "reused_seconds", "runs_at_once", "digest", "mixed"]
+    ]
     for run in table.runs:
         record = run.entry.record if run.entry else None
         reused = sum(record.reused.values()) if record and record.reused else None
@@ -56,6 +58,7 @@ def runs_csv(table: Table) -> str:
                 *(run.planned.scene.name, run.planned.variant.name, str(run.planned.seed), run.status, run.reason),
                 *(_exact(run.values[name]) for name in metrics),
                 *(_exact(reused), str(run.entry.at_once) if run.entry else "", run.planned.digest[:16]),
+                str(run.result.mixed).lower() if run.result else "",
             ]
         )
     return _csv(lines)

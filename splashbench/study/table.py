@@ -15,7 +15,7 @@ from typing import Any
 from splashbench.score import Result
 from splashbench.study.job import Entry, Store
 from splashbench.study.plan import Plan, Planned
-from splashbench.study.spec import DERIVED
+from splashbench.study.spec import DERIVED, metric_of
 
 #: The status of a run that has not been made.
 NOT_RUN = "not run"
@@ -108,6 +108,12 @@ class Table:
     plan: Plan
     rows: tuple[Row, ...]
     scenes_of: Mapping[str, tuple[str, ...]]
+
+    @property
+    def filtered(self) -> bool:
+        """Whether some figure rests on the filter that picks out the liquid of mixed methods."""
+        named = any(metric_of(name).filtered for name in self.plan.spec.metrics)
+        return named and any(row.mixed for row in self.rows)
 
     @property
     def runs(self) -> tuple[Run, ...]:

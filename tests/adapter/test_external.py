@@ -4,6 +4,7 @@ import json
 import os
 import runpy
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -87,6 +88,24 @@ def test_a_good_code_is_measured_checked_and_scored(
     result = read_json(next((tmp_path / "results").glob("*.json")))
     assert (result["method"], result["status"], result["mixed"]) == ("theirs", "ok", True)
     assert result["metrics"]["psnr"]["value"] > 5
+
+
+def test_what_was_trained_before_is_rendered_by_a_command_that_gets_a_copy(
+    balls_directory: Path, balls: Scene, tmp_path: Path
+) -> None:
+    first = _run(balls_directory, tmp_path / "first")
+    trained = Path(shutil.copytree(tmp_path / "first" / "model", tmp_path / "trained"))
+    before = sorted((path, path.stat().st_mtime_ns) for path in trained.rglob("*"))
+    code = ExternalCode("theirs", "", "blender", trained=trained, render_command=_render("good"), points=POINTS)
+    again = run_external(code, balls_directory, tmp_path / "again")
+    assert check_submission(tmp_path / "again", balls) == []
+    np.testing.assert_array_equal(again.rendering("7", 3), first.rendering("7", 3))
+    assert (again.record.fit_seconds, again.record.peak_memory_bytes) == (None, None)
+    assert again.record.storage_bytes == first.record.storage_bytes
+    assert sorted((path, path.stat().st_mtime_ns) for path in trained.rglob("*")) == before
+    for work in (trained / "work", tmp_path):
+        with pytest.raises(SplashbenchError, match="lie within one another; give --work a place of its own"):
+            run_external(code, balls_directory, tmp_path / "other" / "out", work=work)
 
 
 @pytest.mark.parametrize(
@@ -346,7 +365,10 @@ def test_what_cannot_run_is_told_before_anything_does(
         (["external", "--command", "true", "--format", "colmap"], "METHOD external needs --name"),
         (["external", "--name", "theirs", "--format", "colmap"], "METHOD external needs --command"),
         (["external", "--name", "theirs", "--command", "true"], "METHOD external needs --format"),
-        (["external", "--name", "a", "--format", "colmap", "--trained", "b", "--command", "c"], "needs --command, or"),
+        (
+            ["external", "--name", "a", "--format", "colmap", "--trained", "b", "--command", "c"],
+            "are two ways to the same",
+        ),
         (["external", "--name", "a", "--format", "colmap", "--trained", "b"], "--trained needs --import"),
         (["nothing", "--trained", "x"], "--trained is for METHOD external alone"),
         (["nothing", "--command", "true"], "--command is for METHOD external alone"),

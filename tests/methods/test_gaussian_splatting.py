@@ -364,9 +364,10 @@ class TestPlainViews:
     def test_a_scene_with_something_in_it_has_none(self, balls: Scene) -> None:
         assert static_points(balls.training(), 300, "pixels", np.random.default_rng(0)).backdrop is None
         gray = np.full((100, 3), 200, np.uint8)
-        assert plain_color(gray) is not None
+        assert plain_color([gray, gray - 3]) is not None
+        assert plain_color([gray, gray - 4]) is None
         gray[7, 1] += 4
-        assert plain_color(gray) is None
+        assert plain_color([gray]) is None
 
     @pytest.mark.parametrize(
         "name", ["deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d"]
@@ -388,6 +389,8 @@ class TestPlainViews:
         method = load_method("scaffold_4d")
         with pytest.raises(SplashbenchError, match=r"there is nothing to start from, .*; correct the masks"):
             method.fit(plain, method.Config.preset("quick", {}), Run(directory=tmp_path))
+        with pytest.raises(SplashbenchError, match="raise hull_points"):
+            method.fit(plain, method.Config.preset("quick", {"hull_points": 0}), Run(directory=tmp_path))
 
 
 class TestLiquid:

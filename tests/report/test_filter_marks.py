@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
+from splashbench.adapter.runner import run_method
 from splashbench.cli.score import _summary
 from splashbench.report.charts import speed_accuracy_chart
+from splashbench.report.contact_sheet import contact_sheet
 from splashbench.report.leaderboard import leaderboard_rows
 from splashbench.report.markdown import to_markdown
 from splashbench.report.results import Source
+from splashbench.scene import Scene
 from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE, METRICS, filter_mark
 
 FIGURES = {"psnr": 20.0, "miou": 0.71, "spill": 0.123, "spill_rgb": 0.345, "sigma_d": 52.0, "fit_seconds": 60.0}
@@ -66,6 +71,26 @@ def test_the_scores_that_are_printed_are_marked(results: list[Any]) -> None:
     marked = {word.rstrip(FILTER_MARK) for word in together.split() if FILTER_MARK in word}
     assert marked == {"0.7100", "0.1230"}
     assert FILTER_MARK not in _summary([results[0]])
+
+
+def test_the_contact_sheet_marks_the_opacity(balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+
+    def spy(figure: Figure, *rest: object, **more: object) -> None:
+        axes = [text.get_ylabel() for text in figure.axes]
+        written.append("|".join([*axes, figure.get_supxlabel()]))
+        save(figure, *rest, **more)
+
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", spy)
+    out = run_method("hull_points", balls.directory, tmp_path / "submission", timing_frames=0)
+    plain = SimpleNamespace(identity=out.identity, status=out.status, rendering=out.rendering, alpha=out.alpha)
+    mixed = SimpleNamespace(**{**vars(plain), "identity": out.identity.model_copy(update={"mixed": True})})
+    contact_sheet(balls, [plain], tmp_path / "plain.png")
+    contact_sheet(balls, [plain, mixed], tmp_path / "mixed.png")
+    assert FILTER_MARK not in written[0]
+    assert written[1].count(f"foreground\nopacity{FILTER_MARK}") == 1
+    assert FILTER_NOTE[:30] in written[1]
 
 
 def test_the_chart_marks_miou_and_not_lpips(make_result: Any, results: list[Any], tmp_path: Path) -> None:

@@ -208,6 +208,9 @@ def test_figures_of_mixed_methods_that_rest_on_the_filter_are_marked(plan: Plan,
     files = write_report(table, tmp_path / "report", COMMAND)
     assert FILTER_NOTE[:20] in files[-1].read_text()
     assert [row["mixed"] for row in csv.DictReader(io.StringIO(table_csv(table)))] == ["false", "true", "false"]
+    assert {row["mixed"] for row in csv.DictReader(io.StringIO(runs_csv(table))) if row["variant"] == "dark"} == {
+        "true"
+    }
     said = read_json(tmp_path / "report" / "table.json")
     assert [row["mixed"] for row in said["rows"]] == [False, True, False]
     assert {name for name, facts in said["metrics"].items() if facts["filtered"]} == {"delta_e", "sigma_mu_ratio"}
