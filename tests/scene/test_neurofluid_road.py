@@ -78,8 +78,8 @@ def test_runs_are_scored_against_the_held_out_view_and_the_particles(
 SMALL = toml.load(Path(__file__).parents[1] / "methods" / "small_fits.toml")
 
 
-def _run(method: str, scene: Path, out: Path) -> Path:
-    words = [word for key, value in SMALL[method].items() for word in ("--set", f"{key}={value}")]
+def _run(method: str, scene: Path, out: Path, **settings: int) -> Path:
+    words = [word for key, value in (SMALL[method] | settings).items() for word in ("--set", f"{key}={value}")]
     assert main(["run", method, str(scene), str(out), "--preset", "quick", *words, "--timing-frames", "0"]) == 0
     return out
 
@@ -89,11 +89,12 @@ def test_the_methods_of_table_s4_are_fitted_scored_and_stand_beside_it(
 ) -> None:
     scene = Path(shutil.copytree(watersphere, tmp_path / "WaterCube"))
     methods = ("splashsplat", "deformable_3dgs", "spacetime_gaussians", "scaffold_4d")
-    submissions = [_run(method, scene, tmp_path / method) for method in methods]
+    # Gaussians that start faint take a while to show at all.
+    submissions = [_run(method, scene, tmp_path / method, iterations=120) for method in methods]
     scored = _json(capsys, "score", *submissions, "--scene", scene, "--out", tmp_path / "results")
     for result in scored["results"]:
         # Seconds of fitting find the ball, no more; what lies behind it is white from the start.
-        assert result["metrics"]["psnr"] > 12, result["method"]
+        assert result["metrics"]["psnr"] > 16, result["method"]
         assert result["metrics"]["ssim"] > 0.95, result["method"]
     assert main(["leaderboard", str(tmp_path / "results"), str(tmp_path / "board"), "--with-paper"]) == 0
     own, paper = (tmp_path / "board" / "leaderboard.md").read_text().split("As the paper reports it (Table S4")
