@@ -58,10 +58,10 @@ def run_external(
     Raises SplashbenchError for what is wrong before the code starts; a code that fails gives a status instead.
     """
     _require_runnable(code)
-    if work is not None:
-        _require_apart(work, out, scene_directory, *([code.trained] if code.trained is not None else []))
-    scene = Scene.open(scene_directory)
     inputs = [scene_directory, *([code.trained] if code.trained is not None else [])]
+    if work is not None:
+        _require_apart(work, out, *inputs)
+    scene = Scene.open(scene_directory)
     identity = _identity(code, scene, preset or PRESET, seed, device)
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=inputs) as staging,

@@ -101,7 +101,7 @@ class ExternalRun:
         from splashbench.observe import initial_points
 
         for folder in (self.output, self.into):
-            folder.mkdir(exist_ok=folder == self.output and self.code.trained is not None)
+            folder.mkdir(exist_ok=True)  # a trained model is there already
         facts = export_scene(
             self.scene,
             self.exported,

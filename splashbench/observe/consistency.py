@@ -35,11 +35,12 @@ def silhouette_consistent(
     points: the same for all views, or by training view, where each was photographed at an instant of its own.
     """
     by_view = points if isinstance(points, Mapping) else dict.fromkeys(scene.train, points)
-    consistent = np.logical_and.reduce([np.isfinite(by_view[name]).all(axis=1) for name in scene.train])
+    candidates = np.arange(len(by_view[scene.train[0]]))
+    consistent = np.zeros(len(candidates), dtype=bool)
     for name in scene.train:
-        candidates = np.flatnonzero(consistent)
+        candidates = candidates[np.isfinite(by_view[name][candidates]).all(axis=1)]
         if candidates.size == 0:
             break
-        inside = inside_mask(by_view[name][candidates], scene.cameras[name], scene.mask(name, t))
-        consistent[candidates[~inside]] = False
+        candidates = candidates[inside_mask(by_view[name][candidates], scene.cameras[name], scene.mask(name, t))]
+    consistent[candidates] = True
     return consistent

@@ -192,8 +192,8 @@ def _draw_failures(axes: Axes, row: Machine, higher: bool) -> None:
 
 
 def _filtered(rows: list[Machine]) -> set[str]:
-    """Labels of mixed methods of which a panel shows a figure that rests on the protocol's filter."""
-    shown = [row for row in rows if METRICS[row.perceptual_name()].filtered or METRICS[row.quality_name()].filtered]
+    """Labels of mixed methods of which a panel shows mIoU, which rests on the protocol's filter."""
+    shown = [row for row in rows if METRICS[row.perceptual_name()].filtered]
     return {entry.label for row in shown for entry in row.entries if entry.mixed}
 
 

@@ -458,6 +458,28 @@ def assert_same_when_loaded(importer: Importer, fitted: OfficialFitted, scene: S
     np.testing.assert_array_equal(particles[0].positions, particles[1].positions)
 
 
+def _leaves(trained: Path) -> str:
+    """A command that stands in for a training: it leaves what is in `trained`."""
+    return shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(trained)])
+
+
+def _checked_and_scored(
+    scene: Scene, folder: Path, capsys: pytest.CaptureFixture[str], *options: str
+) -> tuple[Path, dict[str, float]]:
+    """A code that leaves `folder`/trained, through run, check and score: the submission, and its figures."""
+    out = folder / "submission"
+    arguments = ["run", "external", str(scene.directory), str(out), "--name", "theirs", *options]
+    arguments += ["--command", _leaves(folder / "trained"), "--points", str(POINTS), "--timing-frames", "1", "--json"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "ok"
+    assert main(["check", str(out), "--scene", str(scene.directory)]) == 0
+    capsys.readouterr()
+    assert main(["score", str(out), "--scene", str(scene.directory), "--out", str(folder / "r"), "--json"]) == 0
+    (result,) = json.loads(capsys.readouterr().out)["results"]
+    assert Submission.open(out).identity.mixed  # the importer says so
+    return out, result["metrics"]
+
+
 def test_the_command_trains_imports_checks_and_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "deformable_3dgs" in registered_importers()
     balls, nerfies = write_balls_scene(tmp_path / "balls", n_frames=3), tmp_path / "NeRF" / "balls"
@@ -465,20 +487,9 @@ def test_the_command_trains_imports_checks_and_scores(tmp_path: Path, capsys: py
     rng = np.random.default_rng(0)
     rows, network = layouts.points_of(nerfies, rng), layouts.deform_network(rng, scale=0.01)
     layouts.write_deformable(tmp_path / "trained", rows, network)
-    command = shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(tmp_path / "trained")])
-    out = tmp_path / "submission"
-    arguments = ["run", "external", str(balls.directory), str(out), "--name", "theirs"]
-    arguments += ["--format", "nerfies", "--command", command, "--import", "deformable_3dgs"]
-    arguments += ["--points", str(POINTS), "--timing-frames", "1", "--json"]
-    assert main(arguments) == 0
-    assert json.loads(capsys.readouterr().out)["status"] == "ok"
-    assert main(["check", str(out), "--scene", str(balls.directory)]) == 0
-    capsys.readouterr()
-    assert main(["score", str(out), "--scene", str(balls.directory), "--out", str(tmp_path / "r"), "--json"]) == 0
-    (result,) = json.loads(capsys.readouterr().out)["results"]
-    assert result["metrics"]["psnr"] > 5
-    assert result["metrics"]["primitives_per_frame"] == 40
-    assert Submission.open(out).identity.mixed  # the importer says so
+    out, metrics = _checked_and_scored(balls, tmp_path, capsys, "--format", "nerfies", "--import", "deformable_3dgs")
+    assert metrics["psnr"] > 5
+    assert metrics["primitives_per_frame"] == 40
     # The picture that was scored is the one of the published formulas.
     share = (balls.times[1] - balls.times[0]) / (balls.times[-1] - balls.times[0])
     box = read_json(nerfies / "scene.json")
@@ -495,20 +506,10 @@ def test_the_other_codes_take_the_same_road(
     if importer == "spacetime_gaussians":
         layouts.write_spacetime(tmp_path / "trained", rows_of(layouts.LITE, rng, 40), None, duration=3)
     else:
-        export_scene(balls, tmp_path / "seen", "blender", initial_points(balls, POINTS), test_images="blank")
         layouts.write_scaffold(tmp_path / "trained", TestScaffold().rows(rng), layouts.scaffold_heads(rng))
-    command = shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(tmp_path / "trained")])
-    out = tmp_path / "submission"
-    arguments = ["run", "external", str(balls.directory), str(out), "--name", "theirs", "--format", layout]
-    arguments += ["--command", command, "--import", importer, "--points", str(POINTS), "--blank-test-images"]
-    assert main([*arguments, "--timing-frames", "1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["status"] == "ok"
-    assert main(["check", str(out), "--scene", str(balls.directory)]) == 0
-    capsys.readouterr()
-    assert main(["score", str(out), "--scene", str(balls.directory), "--out", str(tmp_path / "r"), "--json"]) == 0
-    (result,) = json.loads(capsys.readouterr().out)["results"]
-    assert result["metrics"]["psnr"] > 5
-    assert Submission.open(out).identity.mixed
+    options = ("--format", layout, "--import", importer, "--blank-test-images")
+    out, metrics = _checked_and_scored(balls, tmp_path, capsys, *options)
+    assert metrics["psnr"] > 5
     picture = read_image(out / "renders" / "7" / "000001.png")
     assert picture.std() > 5  # something is drawn
 
@@ -518,7 +519,7 @@ def test_a_model_that_was_trained_before_is_imported_without_a_command(
 ) -> None:
     balls = write_balls_scene(tmp_path / "balls", n_frames=3)
     layouts.write_spacetime(tmp_path / "trained", rows_of(layouts.LITE, np.random.default_rng(0), 40), None, duration=3)
-    command = shlex.join([sys.executable, layouts.__file__, "{scene}", "{out}", str(tmp_path / "trained")])
+    command = _leaves(tmp_path / "trained")
     common = ["--name", "theirs", "--format", "colmap", "--import", "spacetime_gaussians", "--points", str(POINTS)]
     submissions = []
     for name, how in (("run", ["--command", command]), ("taken", ["--trained", str(tmp_path / "trained")])):

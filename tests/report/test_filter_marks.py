@@ -102,6 +102,9 @@ def test_the_chart_marks_miou_and_not_lpips(make_result: Any, results: list[Any]
     with_lpips = [make_result("together", scene=scene, mixed=True, lpips=0.05, **FIGURES) for scene in ("bowl", "tank")]
     # In an SVG, matplotlib says as a comment what it writes.
     note = FILTER_NOTE[2:40]
-    assert note in drawn("miou", results)
+    text = drawn("miou", results)
+    assert note in text
+    assert f"together{FILTER_MARK}" in text
+    assert f"alone{FILTER_MARK}" not in text
     assert note not in drawn("lpips", with_lpips)
     assert note not in drawn("alone", results[:2])
