@@ -74,7 +74,7 @@ def started(
     with one_torch_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(run.seed)
         with run.stage("start"):
-            static = static_points(scene, settings.static_points, settings.static, rng)
+            static = static_points(scene, settings.static_points, settings.static, rng, run)
             start = joined(static, hull_points(scene, settings.hull_points, largest_only))
         if not len(start):
             remedy = "correct the masks" if settings.hull_points else "raise hull_points"
@@ -85,7 +85,7 @@ def started(
 
 
 def static_points(
-    scene: TrainingScene, count: int, source: Literal["pixels", "points"], rng: np.random.Generator
+    scene: TrainingScene, count: int, source: Literal["pixels", "points"], rng: np.random.Generator, run: Run
 ) -> Start:
     """At most `count` points of what is no liquid: lifted pixels, or the scene's sparse points where it has some.
 
@@ -95,6 +95,8 @@ def static_points(
     if source == "points" and sparse is not None and len(sparse):
         seed = sparse_anchors(sparse, count)
     else:
+        if source == "points":
+            run.progress(0, "the scene has no sparse points; pixels are lifted instead")
         plates = [make_plate(scene, name, _PLATE_SIDE) for name in scene.train]
         plates = [plate for plate in plates if plate.seen.any()]
         if not plates:

@@ -322,11 +322,27 @@ class TestStart:
         assert len(set(start.frame.tolist())) == 1
 
     def test_static_points_have_the_colours_and_places_of_the_floor(self, balls: Scene) -> None:
-        start = static_points(balls.training(), 300, "pixels", np.random.default_rng(0))
+        start = static_points(balls.training(), 300, "pixels", np.random.default_rng(0), Run())
         assert 100 < len(start) <= 300
         assert (start.frame == -1).all()
         both = joined(start, hull_points(balls.training(), 40))
         assert len(both) > len(start)
+
+    def test_who_asks_for_sparse_points_is_told_that_there_are_none(self, balls: Scene) -> None:
+        scene, said = balls.training(), list[str]()
+        run = Run(_report=lambda fraction, message: said.append(message))
+        corners = np.array([[x, y, z] for x in range(4) for y in range(4) for z in range(3)], np.float32)
+        sparse = np.hstack([corners, np.full((len(corners), 4), 0.5, np.float32)])
+        scene.initial_points = lambda: sparse  # type: ignore[method-assign]
+        start = static_points(scene, 300, "points", np.random.default_rng(0), run)
+        np.testing.assert_array_equal(start.positions, corners)
+        assert said == []
+        scene.initial_points = lambda: None  # type: ignore[method-assign]
+        lifted = static_points(scene, 300, "points", np.random.default_rng(0), run)
+        assert "no sparse points" in said[0]
+        same = static_points(scene, 300, "pixels", np.random.default_rng(0), run)
+        np.testing.assert_array_equal(lifted.positions, same.positions)
+        assert len(said) == 1
 
     def test_colours_are_those_of_the_photographs(self, balls: Scene) -> None:
         colors = hull_points(balls.training(), 400).colors
@@ -353,7 +369,7 @@ class TestPlainViews:
         return training
 
     def test_the_colour_lies_behind_everything(self, plain: TrainingScene) -> None:
-        start = static_points(plain, 300, "pixels", np.random.default_rng(0))
+        start = static_points(plain, 300, "pixels", np.random.default_rng(0), Run())
         assert len(start) == 0
         assert start.backdrop is not None
         np.testing.assert_allclose(start.backdrop, 240 / 255, atol=1e-6)
@@ -362,7 +378,7 @@ class TestPlainViews:
         assert both.backdrop is start.backdrop
 
     def test_a_scene_with_something_in_it_has_none(self, balls: Scene) -> None:
-        assert static_points(balls.training(), 300, "pixels", np.random.default_rng(0)).backdrop is None
+        assert static_points(balls.training(), 300, "pixels", np.random.default_rng(0), Run()).backdrop is None
         gray = np.full((100, 3), 200, np.uint8)
         assert plain_color([gray, gray - 3]) is not None
         assert plain_color([gray, gray - 4]) is None
