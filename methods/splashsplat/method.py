@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 from splashbench_methods.splashsplat.config import VERSION, SplashSplatConfig
+from splashbench_methods.splashsplat.decoder import Children
 from splashbench_methods.splashsplat.fit import composite
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.occlusion import Occlusion
@@ -45,12 +46,11 @@ class FittedSplashSplat(Fitted):
         return self._background_image[1]
 
     @torch.no_grad()
-    def render(self, camera: Camera, time: float) -> Render:
-        """The view of `camera` at `time` (seconds), any time: between frames the carriers are advected."""
-        background = torch.from_numpy(self._background(camera))
+    def children(self, camera: Camera, time: float) -> Children | None:
+        """The Gaussians of the liquid as `camera` sees them at `time` (seconds); None where there is no liquid."""
         ids, state = self.liquid.track.at(self.liquid.times, time)
         if len(ids) == 0:
-            return Render(background.numpy().copy(), np.zeros(background.shape[:2], dtype=np.float32))
+            return None
         if self.occlusion is not None:
             behind = torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
             state = replace(state, visibility=1 - behind.to(torch.float32))
@@ -58,6 +58,16 @@ class FittedSplashSplat(Fitted):
         eye = torch.tensor(camera.center, dtype=torch.float32)
         with one_torch_thread():
             children, _ = look.decoder.decode(look.features, look.log_scales, ids, state, eye)
+        return children
+
+    @torch.no_grad()
+    def render(self, camera: Camera, time: float) -> Render:
+        """The view of `camera` at `time` (seconds), any time: between frames the carriers are advected."""
+        background = torch.from_numpy(self._background(camera))
+        children = self.children(camera, time)
+        if children is None:
+            return Render(background.numpy().copy(), np.zeros(background.shape[:2], dtype=np.float32))
+        with one_torch_thread():
             rgb, alpha = composite(children, camera, background)
             return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
 
