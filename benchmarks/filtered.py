@@ -9,6 +9,7 @@ and loses nothing, so that figures marked with a dagger compare a method with a 
 splashsplat gets the same: its opacity is drawn again of the Gaussians that pass, each where it is at the render's time;
 the scorer filters its particles; its signed distance is left out, so that volume is taken from particles, as theirs
 is. Pictures stay. SUBMISSION has to have its model (SUBMISSION/model); the copies bear the name splashsplat_filtered.
+The scene's cameras have to share one clock: else theirs are held against every silhouette at its own camera's time.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from splashbench.files import atomic_directory
 from splashbench.observe.consistency import silhouette_consistent
 from splashbench.progress import track
 from splashbench.scene import Camera, Scene, TrainingScene
-from splashbench.submission import IDENTITY, Submission, seal, to_8bit, write_view
+from splashbench.score.protocol import require_same_scene
+from splashbench.submission import IDENTITY, Status, Submission, seal, to_8bit, write_view
 
 
 @torch.no_grad()
@@ -47,16 +49,26 @@ def filtered_opacity(
     return alpha.clamp(0, 1).numpy()
 
 
-def write_filtered(source: Path, scene: Scene, out: Path) -> None:
-    """Write the submission `source` as the filter leaves it, at `out`."""
+def opened(source: Path, scene: Scene) -> Submission:
+    """The submission `source`, which has to be one of splashsplat on `scene`, with its model."""
     submission = Submission.open(source)
     if submission.identity.method != SplashSplat.id:
         raise SplashbenchError(f"{source} is of {submission.identity.method}; give submissions of {SplashSplat.id}")
+    require_same_scene(scene, submission)
+    if submission.status is not Status.OK:
+        raise SplashbenchError(f"{source}: the run ended with status {submission.status.value}; run it again")
     if submission.identity.withheld is not None:
         raise SplashbenchError(f"{source} has withheld timesteps, which have no silhouettes; give one without")
-    training = scene.training()
+    if not (source / "model").is_dir():
+        raise SplashbenchError(f"{source} has no model; run it again without --no-model")
+    return submission
+
+
+def write_filtered(submission: Submission, scene: Scene, out: Path, replace_old: bool) -> None:
+    """Write `submission` as the filter leaves it, at `out`."""
+    source, training = submission.directory, scene.training()
     fitted = SplashSplat().load(source / "model", training)
-    with atomic_directory(out, holds=IDENTITY, inputs=[source]) as staging:
+    with atomic_directory(out, replace=replace_old, holds=IDENTITY, inputs=[source]) as staging:
         for name in scene.test:
             for t in track(range(scene.n_frames), f"filtering {source.name}, view {name}"):
                 seconds = float(scene.camera_times[name][t])
@@ -74,11 +86,18 @@ def main() -> int:
     parser.add_argument("submissions", nargs="+", type=Path)
     parser.add_argument("--scene", required=True, type=Path)
     parser.add_argument("--out", required=True, type=Path, help="folder for the copies, under the same names")
-    arguments = parser.parse_args()
+    parser.add_argument("--replace", action="store_true", help="replace earlier copies")
+    options = parser.parse_args()
     try:
-        scene = Scene.open(arguments.scene)
-        for path in arguments.submissions:
-            write_filtered(path, scene, arguments.out / path.name)
+        scene = Scene.open(options.scene)
+        if any(not np.array_equal(times, scene.times) for times in scene.camera_times.values()):
+            raise SplashbenchError(f"{scene.directory}: cameras have times of their own; give a scene with one clock")
+        names = [path.resolve().name for path in options.submissions]
+        if len(set(names)) < len(names):
+            raise SplashbenchError("two submissions have the same name, and so would their copies; give one at a time")
+        submissions = [opened(path, scene) for path in options.submissions]
+        for name, submission in zip(names, submissions):
+            write_filtered(submission, scene, options.out / name, options.replace)
     except SplashbenchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

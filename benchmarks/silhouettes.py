@@ -3,20 +3,21 @@
     python benchmarks/silhouettes.py SUBMISSION... --scene SCENE --reference NOTHING [--every 1] [--out TABLE.md]
 
 mIoU of the protocol rests on opacity, that of mixed methods on the filter that picks out their liquid
-(docs/protocol.md, "Mixed methods"). This looks at colours alone, and so treats all methods alike: liquid is where a
-picture differs from the control `nothing` by more than --thresholds grey levels on the mean of the channels, and counts
-within --band pixels of the mask, since further off it is haze, which spill_rgb measures. The row "photographs" is what
-the true pictures have: liquid may look like what is behind it, and shadows are no liquid. A method whose background is
-the control's own, as splashsplat's, differs from it by its liquid alone, which is to its advantage here. Not part of
-the protocol: thresholds have no right value.
+(docs/protocol.md, "Mixed methods"). This looks at colours alone: liquid is where a picture differs from the control
+`nothing` by more than --thresholds grey levels on the mean of the channels, and counts within --band pixels of the
+mask, since further off it is haze, which spill_rgb measures. The row "photographs" is what the true pictures have:
+liquid may look like what is behind it, shadows are no liquid, and the control's background is not the true one. What a
+method's own background differs from the control's counts as liquid, too. Frames of fewer than 64 mask pixels count for
+mIoU alone, as in the protocol. Not part of the protocol: thresholds have no right value.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -27,7 +28,8 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import write_text
 from splashbench.progress import track
 from splashbench.scene import Scene
-from splashbench.submission import Submission
+from splashbench.score.protocol import require_reference, require_same_scene
+from splashbench.submission import Status, Submission
 
 _LEAST_PIXELS = 64
 
@@ -53,43 +55,67 @@ def figures(
     """mIoU of the opacity (NaN for photographs, `submission` None), and the overlap at each threshold."""
     views = []
     for name in scene.test:
-        frames = []
+        opaque, changes = [], []
         for t in range(0, scene.n_frames, every):
             mask = scene.mask(name, t)
-            if mask.sum() < _LEAST_PIXELS:
-                continue
-            opaque = np.nan
-            if submission is None:
-                picture = scene.image(name, t)
-            else:
-                picture, alpha = submission.rendering(name, t), submission.alpha(name, t) > 0.5
-                opaque = (mask & alpha).sum() / (mask | alpha).sum()
-            plain = empty.rendering(name, t)
-            changes = [overlap(picture, plain, mask, value, band) for value in thresholds]
-            frames.append([opaque, *changes])
-        if frames:
-            views.append(np.mean(frames, axis=0))
+            if submission is not None:
+                alpha = submission.alpha(name, t) > 0.5
+                either = (mask | alpha).sum()
+                opaque.append((mask & alpha).sum() / either if either else 1.0)
+            if mask.sum() >= _LEAST_PIXELS:
+                picture = scene.image(name, t) if submission is None else submission.rendering(name, t)
+                plain = empty.rendering(name, t)
+                changes.append([overlap(picture, plain, mask, value, band) for value in thresholds])
+        if changes:
+            views.append([np.mean(opaque) if opaque else np.nan, *np.mean(changes, axis=0)])
     if not views:
         raise SplashbenchError(f"{scene.name}: no test view has a frame with {_LEAST_PIXELS} mask pixels")
     return np.asarray(np.mean(views, axis=0))
 
 
+def opened(path: Path, scene: Scene) -> Submission:
+    """The submission at `path`, which has to be of all timesteps of `scene`."""
+    submission = Submission.open(path)
+    require_same_scene(scene, submission)
+    if submission.status is not Status.OK:
+        raise SplashbenchError(f"{path}: the run ended with status {submission.status.value}; run it again")
+    if submission.identity.withheld is not None:
+        raise SplashbenchError(f"{path} has withheld timesteps; give one without")
+    return submission
+
+
 def table(
-    scene: Scene, submissions: Sequence[Path], empty: Submission, thresholds: Sequence[float], band: int, every: int
+    scene: Scene,
+    submissions: Sequence[Submission],
+    empty: Submission,
+    thresholds: Sequence[float],
+    band: int,
+    every: int,
 ) -> str:
-    """The figures as a Markdown table, a row a method."""
-    rows: defaultdict[str, list[NDArray[np.float64]]] = defaultdict(list)
-    rows["photographs"].append(figures(scene, None, empty, thresholds, band, every))
-    for path in track(submissions, "comparing pictures"):
-        submission = Submission.open(path)
-        label = f"{submission.identity.method} (version {submission.identity.method_version})"
-        rows[label].append(figures(scene, submission, empty, thresholds, band, every))
-    heads = ["method", "runs", "mIoU of opacity", *(f"of change, > {value:g}" for value in thresholds)]
+    """The figures as a Markdown table; a row is the mean over runs of one method, version, preset and settings."""
+    rows: defaultdict[tuple[str, ...], list[NDArray[np.float64]]] = defaultdict(list)
+    rows[("photographs", "", "", "")].append(figures(scene, None, empty, thresholds, band, every))
+    for submission in track(submissions, "comparing pictures"):
+        identity = submission.identity
+        settings = json.dumps(identity.settings, sort_keys=True)
+        key = (identity.method, identity.method_version, identity.preset, settings)
+        rows[key].append(figures(scene, submission, empty, thresholds, band, every))
+    heads = ["method", "version", "preset", "runs", "mIoU of opacity"]
+    heads += [f"of change, > {value:g}" for value in thresholds]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for label, found in rows.items():
+    for key, found in rows.items():
         cells = ["" if np.isnan(value) else f"{value:.3f}" for value in np.mean(found, axis=0)]
-        lines.append(f"| {' | '.join([label, str(len(found)), *cells])} |")
+        lines.append(f"| {' | '.join([*key[:3], str(len(found)), *cells])} |")
     return "\n".join(lines) + "\n"
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def number(text: str) -> int:
+        if int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text} is less than {least}")
+        return int(text)
+
+    return number
 
 
 def main() -> int:
@@ -98,20 +124,22 @@ def main() -> int:
     parser.add_argument("submissions", nargs="+", type=Path)
     parser.add_argument("--scene", required=True, type=Path)
     parser.add_argument("--reference", required=True, type=Path, help="a submission of the control `nothing`")
-    parser.add_argument("--every", type=int, default=1, help="every so many frames (default 1)")
+    parser.add_argument("--every", type=_at_least(1), default=1, help="every so many frames (default 1)")
     parser.add_argument("--thresholds", type=float, nargs="+", default=[15, 25, 40], help="grey levels")
-    parser.add_argument("--band", type=int, default=8, help="pixels about the mask that count (default 8)")
+    parser.add_argument("--band", type=_at_least(0), default=8, help="pixels about the mask that count (default 8)")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     try:
         scene, empty = Scene.open(options.scene), Submission.open(options.reference)
-        text = table(scene, options.submissions, empty, options.thresholds, options.band, options.every)
+        require_reference(scene, empty)
+        submissions = [opened(path, scene) for path in options.submissions]
+        text = table(scene, submissions, empty, options.thresholds, options.band, options.every)
+        print(text, end="")
         if options.out:
             write_text(options.out, text)
     except SplashbenchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(text, end="")
     return 0
 
 

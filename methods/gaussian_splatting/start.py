@@ -87,16 +87,15 @@ def started(
 def static_points(
     scene: TrainingScene, count: int, source: Literal["pixels", "points"], rng: np.random.Generator, run: Run
 ) -> Start:
-    """At most `count` points of what is no liquid: lifted pixels, or the scene's sparse points where it has some.
+    """At most `count` points of what is no liquid: lifted pixels or, by `source`, the scene's sparse points.
 
-    None, but a backdrop, where the views show one colour besides the liquid.
+    Pixels, too, where a scene has no sparse points, which the user is told; no points but a backdrop where the views
+    show one colour besides the liquid.
     """
     sparse = scene.initial_points()
     if source == "points" and sparse is not None and len(sparse):
         seed = sparse_anchors(sparse, count)
     else:
-        if source == "points":
-            run.progress(0, "the scene has no sparse points; pixels are lifted instead")
         plates = [make_plate(scene, name, _PLATE_SIDE) for name in scene.train]
         plates = [plate for plate in plates if plate.seen.any()]
         if not plates:
@@ -104,6 +103,8 @@ def static_points(
         backdrop = plain_color([plate.image[plate.seen] for plate in plates])
         if backdrop is not None:
             return replace(_joined([]), backdrop=backdrop)
+        if source == "points":
+            run.progress(0, "no sparse points: pixels lifted instead")
         seed = seed_anchors(sparse, plates, count, rng)
     return Start(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
 

@@ -55,9 +55,9 @@ def score_submission(
     A submission that is not "ok" gives a result with that status and reason, and no score.
     """
     identity = submission.identity
-    _require_same_scene(scene, submission, "submission")
+    require_same_scene(scene, submission, "submission")
     if reference is not None:
-        _require_reference(scene, reference)
+        require_reference(scene, reference)
     status = _text(submission.status)
     metrics = _costs(submission.record)
     weights_digest = None
@@ -119,7 +119,8 @@ def _text(status: Any) -> str:
     return str(getattr(status, "value", status))
 
 
-def _require_same_scene(scene: Scene, submission: Any, what: str) -> None:
+def require_same_scene(scene: Scene, submission: Any, what: str = "submission") -> None:
+    """Raise SplashbenchError unless `submission` was made for these very bytes of `scene`."""
     if submission.identity.scene_digest != scene.digest:
         raise SplashbenchError(
             f"the {what} of {submission.identity.method} was made for another version of scene "
@@ -127,7 +128,8 @@ def _require_same_scene(scene: Scene, submission: Any, what: str) -> None:
         )
 
 
-def _require_reference(scene: Scene, reference: Any) -> None:
+def require_reference(scene: Scene, reference: Any) -> None:
+    """Raise SplashbenchError unless `reference` is a finished submission of the control `nothing` for `scene`."""
     if reference.identity.method != REFERENCE_METHOD or not reference.identity.control:
         raise SplashbenchError(
             f"the reference is a submission of {reference.identity.method}; give one of the control {REFERENCE_METHOD}"
@@ -136,7 +138,7 @@ def _require_reference(scene: Scene, reference: Any) -> None:
         raise SplashbenchError(
             f"the reference ended with status {_text(reference.status)}; run {REFERENCE_METHOD} again"
         )
-    _require_same_scene(scene, reference, "reference")
+    require_same_scene(scene, reference, "reference")
 
 
 def _costs(record: Any) -> dict[str, MetricValue]:

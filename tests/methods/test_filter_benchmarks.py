@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +16,7 @@ from splashbench_methods.splashsplat.method import SplashSplat
 from splashbench import toml
 from splashbench.cli.main import main
 from splashbench.scene import Scene
-from splashbench.submission import Submission
+from splashbench.submission import Submission, seal
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = toml.load(Path(__file__).parent / "small_fits.toml")["splashsplat"]
@@ -61,7 +63,11 @@ def test_the_filter_leaves_what_all_silhouettes_allow(runs: Path, balls: Scene) 
 
 
 def test_copies_are_sound_mixed_and_scored(
-    runs: Path, balls_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    runs: Path,
+    balls_directory: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     source = runs / "splashsplat"
     assert run("filtered", monkeypatch, source, "--scene", balls_directory, "--out", tmp_path) == 0
@@ -74,19 +80,54 @@ def test_copies_are_sound_mixed_and_scored(
     name = Scene.open(balls_directory).test[0]
     np.testing.assert_array_equal(submission.rendering(name, 2), original.rendering(name, 2))
     assert submission.alpha(name, 2).sum() < original.alpha(name, 2).sum()
-    assert main(["score", str(copy), "--scene", str(balls_directory), "--out", str(tmp_path / "results")]) == 0
+    scored = {}
+    for path in (copy, source):
+        capsys.readouterr()
+        words = ["score", str(path), "--scene", str(balls_directory), "--out", str(tmp_path / "results"), "--json"]
+        assert main(words) == 0
+        (result,) = json.loads(capsys.readouterr().out)["results"]
+        scored[path] = result["metrics"]
+    assert scored[copy]["psnr"] == scored[source]["psnr"]
+    assert scored[copy]["spill"] < scored[source]["spill"]
+    # The scorer filters the particles of what is mixed.
+    assert scored[copy]["sigma_d"] != scored[source]["sigma_d"]
+    assert scored[copy]["mu_d"] != scored[source]["mu_d"]
 
 
-def test_what_has_no_liquid_of_its_own_is_refused(
+def test_what_cannot_be_filtered_is_refused_before_anything_is_written(
     runs: Path,
     balls_directory: Path,
+    balls_copy: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert run("filtered", monkeypatch, runs / "nothing", "--scene", balls_directory, "--out", tmp_path / "out") == 1
-    assert "give submissions of splashsplat" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    good, out = runs / "splashsplat", tmp_path / "out"
+    bare = Path(shutil.copytree(good, tmp_path / "bare", ignore=shutil.ignore_patterns("model")))
+    seal(bare, Submission.open(good).identity, Submission.open(good).record)
+    mask = next((balls_copy / "seg").rglob("*.png"))
+    mask.write_bytes(next(path for path in sorted(mask.parent.glob("*.png")) if path != mask).read_bytes())
+    for scene, other, said in (
+        (balls_directory, runs / "nothing", "give submissions of splashsplat"),
+        (balls_directory, bare, "without --no-model"),
+        (balls_directory, good, "the same name"),
+        (balls_copy, bare, "another version of scene"),
+    ):
+        assert run("filtered", monkeypatch, good, other, "--scene", scene, "--out", out) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+    assert not out.exists()
+
+
+def test_silhouettes_are_compared_with_the_control(
+    runs: Path, balls_directory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [runs / "oracle", "--scene", balls_directory, "--reference", runs / "oracle"]
+    assert run("silhouettes", monkeypatch, *words) == 1
+    assert "give one of the control nothing" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run("silhouettes", monkeypatch, *words, "--every", "0")
+    assert "0 is less than 1" in capsys.readouterr().err
 
 
 def test_overlap_of_a_square_that_has_moved() -> None:
@@ -110,7 +151,7 @@ def test_the_truth_overlaps_like_the_photographs(
     table = tmp_path / "table.md"
     words = [runs / "oracle", runs / "nothing", "--scene", balls_directory, "--reference", runs / "nothing"]
     assert run("silhouettes", monkeypatch, *words, "--every", 3, "--thresholds", 25, "--out", table) == 0
-    rows = {line.split("|")[1].split(" (")[0].strip(): line.split("|")[3:5] for line in table.read_text().splitlines()}
+    rows = {line.split("|")[1].strip(): line.split("|")[5:7] for line in table.read_text().splitlines()}
     photographs, oracle, nothing = (rows[name] for name in ("photographs", "oracle", "nothing"))
     assert float(oracle[0]) == 1
     assert oracle[1] == photographs[1]

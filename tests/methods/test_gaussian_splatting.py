@@ -369,7 +369,10 @@ class TestPlainViews:
         return training
 
     def test_the_colour_lies_behind_everything(self, plain: TrainingScene) -> None:
-        start = static_points(plain, 300, "pixels", np.random.default_rng(0), Run())
+        said = list[str]()
+        run = Run(_report=lambda fraction, message: said.append(message))
+        start = static_points(plain, 300, "points", np.random.default_rng(0), run)
+        assert said == []  # nothing is lifted here
         assert len(start) == 0
         assert start.backdrop is not None
         np.testing.assert_allclose(start.backdrop, 240 / 255, atol=1e-6)
