@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from splashbench_methods.gaussian_splatting import fitting
+from splashbench_methods.gaussian_splatting.density import DensityControl
+from splashbench_methods.gaussian_splatting.optimizer import RowOptimizer
 from splashbench_methods.scaffold_gs import fitting as background_fitting
 
 from splashbench import toml
@@ -44,14 +46,35 @@ def test_masks_give_the_first_points_and_are_not_looked_at_again(name: str, ball
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_preset_paper_fits(name: str, balls: Scene, tmp_path: Path) -> None:
+def test_preset_paper_fits(name: str, balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The published settings, but for the steps, what is counted in steps, and sizes: growth, resets and guided samples
     take part."""
+    grown, reset, placed = [], [], []
+    replace_rows, set_rows, append = RowOptimizer.replace_rows, RowOptimizer.set_rows, DensityControl.append
+
+    def replaced(self: RowOptimizer, kept: Any, new: Any) -> None:
+        grown.append(max(map(len, new.values())))
+        replace_rows(self, kept, new)
+
+    def were_set(self: RowOptimizer, table: str, values: Any, rows: Any = None) -> None:
+        reset.append(table)
+        set_rows(self, table, values, rows)
+
+    def appended(self: DensityControl, new: Any) -> None:
+        placed.append(len(new["positions"]))
+        append(self, new)
+
+    monkeypatch.setattr(RowOptimizer, "replace_rows", replaced)
+    monkeypatch.setattr(RowOptimizer, "set_rows", were_set)
+    monkeypatch.setattr(DensityControl, "append", appended)
     steps = {"grow_every": 5, "reset_every": 10, "guided_every": 3, "sh_every": 10}
     fields = load_method(name).Config.model_fields
     counted = {key: value for key, value in steps.items() if key in fields}
     fitted: Any = fit(name, balls.training(), tmp_path, "paper", iterations=120, **counted)
     assert len(fitted.history.psnr) == 120
+    assert max(grown) > 0
+    assert ("opacity_logits" in reset) == (name != "scaffold_4d")
+    assert bool(placed) == name.startswith("spacetime_gaussians")
     assert fitted.history.psnr[-20:].mean() > fitted.history.psnr[:5].mean()
     image = fitted.render(balls.cameras["6"], float(balls.times[2])).rgb
     assert image.shape == (64, 96, 3)

@@ -12,8 +12,8 @@ from splashbench.submission import Status, Submission
 
 SETTINGS = toml.load(Path(__file__).with_name("small_fits.toml"))
 PEEKING = Path(__file__).parents[1] / "conformance" / "methods_for_conformance.py"
-# The lite variant is read as the full one is, scaffold_gs as `nothing` is, and splashsplat takes the longest.
-_SLOW = ("splashsplat", "spacetime_gaussians_lite", "scaffold_gs")
+# The lite variant is read as the full one is, scaffold_gs as `nothing` is.
+_SLOW = ("spacetime_gaussians_lite", "scaffold_gs")
 
 
 @pytest.fixture(scope="module")

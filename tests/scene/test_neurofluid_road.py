@@ -103,13 +103,14 @@ def test_the_methods_of_table_s4_are_fitted_scored_and_stand_beside_it(
         assert f"| {method} | {figures} |" in paper
 
 
-def test_a_fit_does_not_see_the_test_view(watersphere: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["splashsplat", "scaffold_4d"])
+def test_a_fit_does_not_see_the_test_view(method: str, watersphere: Path, tmp_path: Path) -> None:
     """One file has a view's picture and its mask: those of view 5, and its particles, are cut short here."""
     blind = Path(shutil.copytree(watersphere, tmp_path / "WaterSphere"))
     for path in sorted((blind / "view_5").rglob("*.*")):
         if path.suffix in (".png", ".npz"):
             path.write_bytes(path.read_bytes()[:60])  # a PNG's size is in its head
-    found = [_run("scaffold_4d", scene, tmp_path / f"of_{i}") for i, scene in enumerate((watersphere, blind))]
+    found = [_run(method, scene, tmp_path / f"of_{i}") for i, scene in enumerate((watersphere, blind))]
     files = [
         path.relative_to(found[0])
         for folder in ("renders", "alpha", "model")
