@@ -40,7 +40,7 @@ class Metric:
     def filtered(self) -> bool:
         """Whether, of a mixed method, the figure is of those primitives alone that the silhouettes allow to be liquid.
 
-        That filter is ours, no part of the method (observe/consistency.py), so tables and charts mark such figures.
+        The filter is no part of the method (observe/consistency.py), so tables and charts mark such figures.
         """
         return self.group in ("particles", "truth") or self.name in ("spill", "miou", "carriers_per_frame")
 
