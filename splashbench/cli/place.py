@@ -48,9 +48,12 @@ def register(actions: argparse._SubParsersAction) -> None:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is no length")
+        raise argparse.ArgumentTypeError(f"{text!r} is no length")
     return value
 
 
@@ -67,6 +70,8 @@ def place(arguments: argparse.Namespace) -> int:
         raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace places it anew")
     if arguments.picture is not None:
         require_file_place(arguments.picture)
+    if not arguments.mesh.is_file():
+        raise SplashbenchError(f"{arguments.mesh} is no file; give the container's mesh")
     mesh = read_mesh(arguments.mesh)
     masked = None if arguments.masks is None else Scene.open(arguments.masks)
     found = place_in_scene(scene, mesh, masked, arguments.up, arguments.metres_per_unit)

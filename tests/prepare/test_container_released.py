@@ -109,15 +109,21 @@ def test_a_scan_tells_place_gravity_and_scale(
 def test_what_scene_json_said_stays_and_a_container_is_replaced_on_demand(
     released: Path, scan: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (released / "scene.json").write_text(json.dumps({"name": "mine", "times": [i / 20 for i in range(8)]}))
+    tilted = [0.0, -0.8, -0.6]  # somebody knew better
+    (released / "scene.json").write_text(
+        json.dumps({"name": "mine", "times": [i / 20 for i in range(8)], "gravity": tilted})
+    )
     place(capsys, released, scan, "--metres-per-unit", "0.01", "--transparent")
     found = json.loads((released / "scene.json").read_text())
     assert (found["name"], found["times"][2], found["container_transparent"]) == ("mine", 0.1, True)
+    assert found["gravity"] == tilted
+    assert found["metres_per_unit"] == pytest.approx(1, rel=0.02)
     before = everything(released)
     assert "--replace" in refused(capsys, released, scan)
     assert everything(released) == before
     place(capsys, released, scan, "--replace", "--up", "y")  # in metres: a giant's
     again = json.loads((released / "scene.json").read_text())
+    assert again["gravity"][1] < -0.99
     assert again["metres_per_unit"] == pytest.approx(100 * found["metres_per_unit"], rel=0.02)
     assert again["container_transparent"] is True
 
@@ -146,6 +152,6 @@ def test_another_mesh_is_refused_and_nothing_written(
     trimesh.creation.box((3, 0.05, 0.05)).export(rod)
     before = everything(released)
     assert "check that it is this container's" in refused(capsys, released, rod)
-    assert "does not exist" in refused(capsys, released, tmp_path / "none.glb")
+    assert "is no file" in refused(capsys, released, tmp_path / "none.glb")
     assert everything(released) == before
     assert read_mesh(rod).is_closed

@@ -51,7 +51,7 @@ def place_in_scene(
     """Where `mesh` stands in `scene`, by its container masks, or by those of `masked`.
 
     masked: the scene before it was cropped, of the same cameras. up: the mesh's direction that points up; None tries
-    all. metres_per_unit: of the mesh.
+    all. metres_per_unit: of the mesh. Gravity and metric scale that a scene without a container states stay.
 
     Raises SplashbenchError for fewer than two masks of training cameras, other cameras than the scene's, and a mesh
     that does not cover its masks.
@@ -83,7 +83,12 @@ def place_in_scene(
             f" views), less than {LEAST_OVERLAP}; check that it is this container's, and say what of it is up (--up)"
         )
     x, y, z = up_from_container(placement)
-    return ReleasedPlacement(placement, projections, (-x, -y, -z), metres_per_unit / placement.scale)
+    gravity, metres = (-x, -y, -z), metres_per_unit / placement.scale
+    known = scene.meta
+    if known is not None and known.container_mesh is None:
+        # Said by someone who knew, not by an earlier placement.
+        gravity, metres = known.gravity or gravity, known.metres_per_unit or metres
+    return ReleasedPlacement(placement, projections, gravity, metres)
 
 
 def _masks(scene: Scene, masked: Scene) -> dict[str, NDArray[np.bool_]]:
