@@ -151,7 +151,7 @@ def files_together(directory: Path) -> Iterator[Path]:
 
     Unlike `atomic_directory` it leaves other files in `directory` where they are.
     """
-    directory = Path(directory)
+    directory = Path(directory).resolve()  # "." has no name to put one beside, and a link may lead to another disk
     require_folder_place(directory)
     directory.parent.mkdir(parents=True, exist_ok=True)
     staging = _sibling(directory)

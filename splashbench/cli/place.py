@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from splashbench.cli.output import add_json, emit, say
+
+if TYPE_CHECKING:
+    from splashbench.prepare.container.released import ReleasedPlacement
+    from splashbench.scene.layout import SceneMeta
+
+# Beyond these, what scene.json said and what the container says of gravity and scale are told apart.
+_TILT_DEGREES, _SCALE = 3.0, 1.05
 
 _EPILOG = """\
 examples:
@@ -13,8 +22,9 @@ examples:
   splashbench scene place data/real_scene_crop/bowl_001 data/meshes/bowl_001.glb --masks data/real_scene/bowl_001
 
 The masks in container_mask/ of the training cameras place the mesh, those of the test cameras verify it. MESH is copied
-into the scene, and scene.json says where it stands, what is down (a container stands upright) and how long a scene unit
-is (a scan is in metres). splashsplat uses all three. The scene is another one for the scorer then: run methods again.
+into the scene, and scene.json says where it stands, what is down (a container stands upright; its mesh has to be level
+in its own coordinates) and how long a scene unit is (a scan is in metres), unless it said so before. splashsplat uses
+all three. The scene is another one for the scorer then: run methods again.
 """
 
 
@@ -40,9 +50,14 @@ def register(actions: argparse._SubParsersAction) -> None:
     action.add_argument(
         "--metres-per-unit", type=_positive, default=1.0, metavar="M", help="length of the mesh's unit (default 1)"
     )
-    action.add_argument("--transparent", action="store_true", help="the liquid is seen through the container's walls")
+    action.add_argument(
+        "--transparent",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="whether the liquid is seen through the container's walls (default: as scene.json says; else not)",
+    )
     action.add_argument("--picture", type=Path, metavar="PNG", help="draw the placed outline over every camera's image")
-    action.add_argument("--replace", action="store_true", help="replace what scene.json says of a container")
+    action.add_argument("--replace", action="store_true", help="replace container, gravity and scale in scene.json")
     add_json(action)
     action.set_defaults(handler=place)
 
@@ -61,34 +76,38 @@ def place(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene place`."""
     from splashbench.errors import SplashbenchError
     from splashbench.files import require_file_place, write_png
-    from splashbench.prepare.container.released import picture, place_in_scene, write_placement
+    from splashbench.prepare.container.released import name_in_scene, picture, place_in_scene, write_placement
     from splashbench.scene import Scene
     from splashbench.scene.container import read_mesh
 
     scene = Scene.open(arguments.scene)
-    if scene.meta is not None and scene.meta.container_mesh is not None and not arguments.replace:
-        raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace places it anew")
+    name_in_scene(scene, arguments.mesh, arguments.replace)
     if arguments.picture is not None:
+        if arguments.picture.suffix.lower() != ".png":
+            raise SplashbenchError(f"{arguments.picture}: the picture is a PNG; give a name that ends in .png")
         require_file_place(arguments.picture)
-    if not arguments.mesh.is_file():
-        raise SplashbenchError(f"{arguments.mesh} is no file; give the container's mesh")
     mesh = read_mesh(arguments.mesh)
     masked = None if arguments.masks is None else Scene.open(arguments.masks)
     found = place_in_scene(scene, mesh, masked, arguments.up, arguments.metres_per_unit)
-    write_placement(scene, arguments.mesh, found, True if arguments.transparent else None)
-    if arguments.picture is not None:
-        write_png(arguments.picture, picture(scene, mesh, found))
+    drawn = None if arguments.picture is None else picture(scene, mesh, found)
+    meta = write_placement(scene, arguments.mesh, found, arguments.transparent, arguments.replace)
+    if drawn is not None:
+        write_png(arguments.picture, drawn)
+    placement = found.placement
     if arguments.json:
         emit(
             {
                 "scene": str(scene.directory),
-                "pose": found.placement.pose.tolist(),
-                "gravity": list(found.gravity),
-                "metres_per_unit": found.metres_per_unit,
-                "up_axis": found.placement.up_axis,
-                "up_is_ambiguous": found.placement.up_is_ambiguous,
-                "turn": found.placement.turn,
+                "pose": placement.pose.tolist(),
+                "gravity": meta.gravity,
+                "metres_per_unit": meta.metres_per_unit,
+                "found_gravity": found.gravity,
+                "found_metres_per_unit": found.metres_per_unit,
+                "up_axis": placement.up_axis,
+                "up_is_ambiguous": placement.up_is_ambiguous,
+                "turn": placement.turn,
                 "overlap": {name: projection.iou for name, projection in found.projections.items()},
+                "doubtful": found.doubtful(),
             }
         )
     for name, projection in found.projections.items():
@@ -96,7 +115,25 @@ def place(arguments: argparse.Namespace) -> int:
         off = "" if distance is None else f", outlines {distance:.2f} px apart"
         held_out = "" if name in scene.train else " (held out)"
         say(f"camera {name}{held_out}: mesh and mask overlap {projection.iou:.3f}{off}")
-    if found.placement.up_is_ambiguous:
-        say(f"note: the mesh fits with other directions up as well; {found.placement.up_axis} was taken, see --up")
-    say(f"wrote {scene.directory / 'scene.json'}: a scene unit is {found.metres_per_unit:.4g} m")
+    _say_what_is_doubtful(found, meta)
+    say(f"wrote {scene.directory / 'scene.json'}: a scene unit is {meta.metres_per_unit:.4g} m; run methods again")
     return 0
+
+
+def _say_what_is_doubtful(found: ReleasedPlacement, meta: SceneMeta) -> None:
+    placement = found.placement
+    if found.doubtful():
+        say(f"note: little overlap in camera {', '.join(found.doubtful())}; look at --picture before you trust it")
+    if placement.up_is_ambiguous:
+        say(f"note: the mesh fits with other directions up as well; {placement.up_axis} was taken, see --up")
+    if placement.turn != "determined":
+        looks = "however it is turned" if placement.turn == "free" else f"at {placement.equivalent_turns} turns"
+        say(f"note: the container looks the same {looks}; one was taken")
+    angle = math.degrees(math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(meta.gravity or (), found.gravity))))))
+    if angle > _TILT_DEGREES:
+        say(f"note: scene.json's gravity stays, {angle:.0f} degrees from the container's; --replace replaces it")
+    if not 1 / _SCALE < (meta.metres_per_unit or 0) / found.metres_per_unit < _SCALE:
+        say(
+            f"note: scene.json's metres_per_unit stays, {meta.metres_per_unit:.4g}; by the mesh it is"
+            f" {found.metres_per_unit:.4g}, see --metres-per-unit; --replace replaces it"
+        )

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from splashbench.cli.main import main
-from splashbench.files import read_image, write_png
+from splashbench.files import read_gray, read_image, write_png
 from splashbench.prepare.container.check import intersection_over_union, silhouette
 from splashbench.scene import Scene
 from splashbench.scene.container import ContainerMesh, read_mesh
@@ -107,21 +107,27 @@ def test_a_scan_tells_place_gravity_and_scale(
 
 
 def test_what_scene_json_said_stays_and_a_container_is_replaced_on_demand(
-    released: Path, scan: Path, capsys: pytest.CaptureFixture[str]
+    released: Path, scan: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tilted = [0.0, -0.8, -0.6]  # somebody knew better
     (released / "scene.json").write_text(
         json.dumps({"name": "mine", "times": [i / 20 for i in range(8)], "gravity": tilted})
     )
-    place(capsys, released, scan, "--metres-per-unit", "0.01", "--transparent")
+    said = place(capsys, released, scan, "--metres-per-unit", "0.01", "--transparent")
+    assert said["gravity"] == tilted
+    assert said["found_gravity"][1] < -0.99
     found = json.loads((released / "scene.json").read_text())
     assert (found["name"], found["times"][2], found["container_transparent"]) == ("mine", 0.1, True)
     assert found["gravity"] == tilted
     assert found["metres_per_unit"] == pytest.approx(1, rel=0.02)
     before = everything(released)
     assert "--replace" in refused(capsys, released, scan)
+    stl = Path(shutil.copy(scan, scan.with_suffix(".stl")))
+    assert "convert it" in refused(capsys, released, stl, "--replace")
+    assert "ends in .png" in refused(capsys, released, scan, "--replace", "--picture", "picture")
     assert everything(released) == before
-    place(capsys, released, scan, "--replace", "--up", "y")  # in metres: a giant's
+    monkeypatch.chdir(released)
+    place(capsys, ".", scan, "--replace", "--up", "y")  # in metres: a giant's
     again = json.loads((released / "scene.json").read_text())
     assert again["gravity"][1] < -0.99
     assert again["metres_per_unit"] == pytest.approx(100 * found["metres_per_unit"], rel=0.02)
@@ -141,7 +147,10 @@ def test_a_cropped_scene_takes_the_masks_of_the_whole_one(
     (other / "train_meta.json").write_text(json.dumps(meta))
     assert "camera 1 stands elsewhere" in refused(capsys, cropped, scan, "--masks", other)
     assert everything(cropped) == before
-    place(capsys, cropped, scan, "--masks", released, "--metres-per-unit", "0.01")
+    # A held-out camera decides nothing, and is doubted.
+    wrong = read_gray(released / "container_mask" / "6.png")
+    write_png(released / "container_mask" / "6.png", np.roll(wrong, 40, axis=1))
+    assert place(capsys, cropped, scan, "--masks", released, "--metres-per-unit", "0.01")["doubtful"] == ["6"]
     assert Scene.open(cropped).metres_per_unit == pytest.approx(1, rel=0.02)
 
 
@@ -154,4 +163,7 @@ def test_another_mesh_is_refused_and_nothing_written(
     assert "check that it is this container's" in refused(capsys, released, rod)
     assert "is no file" in refused(capsys, released, tmp_path / "none.glb")
     assert everything(released) == before
+    (released / "container.ply").write_bytes(b"somebody's")
+    assert "is there already" in refused(capsys, released, rod)
+    assert (released / "container.ply").read_bytes() == b"somebody's"
     assert read_mesh(rod).is_closed

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import files_together, write_model
+from splashbench.files import files_together, require_folder_place, write_model
 from splashbench.prepare.container.check import Projection, overlay, verify
 from splashbench.prepare.container.placement import Axis, Placement, place_by_silhouettes, up_from_container
 from splashbench.scene import Scene
-from splashbench.scene.container import ContainerMesh
+from splashbench.scene.container import FORMATS, ContainerMesh
 from splashbench.scene.layout import SceneMeta, plain_name
 
 # Below this overlap, on the median of the views that decided, it is another mesh or another container.
@@ -35,8 +35,8 @@ class ReleasedPlacement:
     Attributes:
         placement: the mesh's pose, scale and upward direction.
         projections: how each camera that has a mask sees it, held-out ones too.
-        gravity: unit vector [3] along which things fall, scene coordinates.
-        metres_per_unit: of the scene.
+        gravity: unit vector [3] along which things fall if the container stands upright, scene coordinates.
+        metres_per_unit: of the scene, if the mesh's own is right.
     """
 
     placement: Placement
@@ -44,14 +44,18 @@ class ReleasedPlacement:
     gravity: tuple[float, float, float]
     metres_per_unit: float
 
+    def doubtful(self) -> list[str]:
+        """Cameras in which mesh and mask overlap too little, among them such as did not decide."""
+        return [name for name, projection in self.projections.items() if projection.iou < LEAST_OVERLAP]
+
 
 def place_in_scene(
     scene: Scene, mesh: ContainerMesh, masked: Scene | None = None, up: Axis | None = None, metres_per_unit: float = 1.0
 ) -> ReleasedPlacement:
     """Where `mesh` stands in `scene`, by its container masks, or by those of `masked`.
 
-    masked: the scene before it was cropped, of the same cameras. up: the mesh's direction that points up; None tries
-    all. metres_per_unit: of the mesh. Gravity and metric scale that a scene without a container states stay.
+    masked: the scene before it was cropped, of the same cameras. up: the mesh's direction that points up, exactly; None
+    tries all axes. metres_per_unit: of the mesh.
 
     Raises SplashbenchError for fewer than two masks of training cameras, other cameras than the scene's, and a mesh
     that does not cover its masks.
@@ -72,7 +76,7 @@ def place_in_scene(
         {camera.name: masks[camera.name] for camera in training},
         up=up,
         metres_per_unit=None,
-        gravity=scene.gravity,
+        gravity=None,
         source=source,
     )
     projections = verify(mesh, placement.pose, cameras, masks)
@@ -83,12 +87,7 @@ def place_in_scene(
             f" views), less than {LEAST_OVERLAP}; check that it is this container's, and say what of it is up (--up)"
         )
     x, y, z = up_from_container(placement)
-    gravity, metres = (-x, -y, -z), metres_per_unit / placement.scale
-    known = scene.meta
-    if known is not None and known.container_mesh is None:
-        # Said by someone who knew, not by an earlier placement.
-        gravity, metres = known.gravity or gravity, known.metres_per_unit or metres
-    return ReleasedPlacement(placement, projections, gravity, metres)
+    return ReleasedPlacement(placement, projections, (-x, -y, -z), metres_per_unit / placement.scale)
 
 
 def _masks(scene: Scene, masked: Scene) -> dict[str, NDArray[np.bool_]]:
@@ -107,22 +106,43 @@ def _masks(scene: Scene, masked: Scene) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
-def write_placement(scene: Scene, mesh_file: Path, found: ReleasedPlacement, transparent: bool | None = None) -> None:
-    """Copy the mesh into the scene's folder and say in scene.json where it stands; other fields there stay."""
+def name_in_scene(scene: Scene, mesh_file: Path, replace: bool) -> str:
+    """What the mesh's file is to be called in the scene's folder.
+
+    Raises SplashbenchError, before long work, for a file of no format that scenes have, for a scene whose folder may
+    not be written, and where a container is there already, unless it is to be replaced.
+    """
+    if mesh_file.suffix.lower() not in FORMATS:
+        raise SplashbenchError(f"{mesh_file} is none of {', '.join(FORMATS)}; convert it")
+    if not mesh_file.is_file():
+        raise SplashbenchError(f"{mesh_file} is no file; give the container's mesh")
+    require_folder_place(scene.directory)
+    if not replace and scene.meta is not None and scene.meta.container_mesh is not None:
+        raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace places it anew")
     name = f"container{mesh_file.suffix.lower()}"
+    if not replace and (scene.directory / name).exists():
+        raise SplashbenchError(f"{scene.directory / name} is there already; move it away, or --replace to replace it")
+    return name
+
+
+def write_placement(
+    scene: Scene, mesh_file: Path, found: ReleasedPlacement, transparent: bool | None = None, replace: bool = False
+) -> SceneMeta:
+    """Copy the mesh into the scene's folder and say in scene.json where it stands; returns what stands there.
+
+    Other fields there stay. Gravity and scale that it stated stay, too, unless `replace`.
+    """
+    name = name_in_scene(scene, mesh_file, replace)
     known = scene.meta or SceneMeta(name=plain_name(scene.name))
-    said = {
-        "container_mesh": name,
-        "container_pose": found.placement.pose.tolist(),
-        "gravity": found.gravity,
-        "metres_per_unit": found.metres_per_unit,
-    }
-    if transparent is not None:
-        said["container_transparent"] = transparent
+    said = {"container_mesh": name, "container_pose": found.placement.pose.tolist()}
+    said |= {} if known.gravity and not replace else {"gravity": found.gravity}
+    said |= {} if known.metres_per_unit and not replace else {"metres_per_unit": found.metres_per_unit}
+    said |= {} if transparent is None else {"container_transparent": transparent}
     meta = SceneMeta.model_validate(known.model_dump() | said)
     with files_together(scene.directory) as staging:
         shutil.copyfile(mesh_file, staging / name)
         write_model(staging / "scene.json", meta)
+    return meta
 
 
 def picture(scene: Scene, mesh: ContainerMesh, found: ReleasedPlacement, width: int = 640) -> NDArray[np.uint8]:
