@@ -30,8 +30,8 @@ from splashbench.files import atomic_directory
 from splashbench.observe.consistency import silhouette_consistent
 from splashbench.progress import track
 from splashbench.scene import Camera, Scene, TrainingScene
-from splashbench.score.protocol import require_same_scene
-from splashbench.submission import IDENTITY, Status, Submission, seal, to_8bit, write_view
+from splashbench.score.protocol import require_complete
+from splashbench.submission import IDENTITY, Submission, seal, to_8bit, write_view
 
 
 @torch.no_grad()
@@ -54,11 +54,7 @@ def opened(source: Path, scene: Scene) -> Submission:
     submission = Submission.open(source)
     if submission.identity.method != SplashSplat.id:
         raise SplashbenchError(f"{source} is of {submission.identity.method}; give submissions of {SplashSplat.id}")
-    require_same_scene(scene, submission)
-    if submission.status is not Status.OK:
-        raise SplashbenchError(f"{source}: the run ended with status {submission.status.value}; run it again")
-    if submission.identity.withheld is not None:
-        raise SplashbenchError(f"{source} has withheld timesteps, which have no silhouettes; give one without")
+    require_complete(scene, submission)
     if not (source / "model").is_dir():
         raise SplashbenchError(f"{source} has no model; run it again without --no-model")
     return submission

@@ -28,10 +28,10 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import write_text
 from splashbench.progress import track
 from splashbench.scene import Scene
-from splashbench.score.protocol import require_reference, require_same_scene
-from splashbench.submission import Status, Submission
-
-_LEAST_PIXELS = 64
+from splashbench.score import PROTOCOL_V1
+from splashbench.score.protocol import require_complete, require_reference
+from splashbench.score.silhouette import iou
+from splashbench.submission import Submission
 
 
 def overlap(
@@ -59,29 +59,17 @@ def figures(
         for t in range(0, scene.n_frames, every):
             mask = scene.mask(name, t)
             if submission is not None:
-                alpha = submission.alpha(name, t) > 0.5
-                either = (mask | alpha).sum()
-                opaque.append((mask & alpha).sum() / either if either else 1.0)
-            if mask.sum() >= _LEAST_PIXELS:
+                opaque.append(iou(submission.alpha(name, t), mask, PROTOCOL_V1.opacity_threshold))
+            if mask.sum() >= PROTOCOL_V1.min_mask_pixels:
                 picture = scene.image(name, t) if submission is None else submission.rendering(name, t)
                 plain = empty.rendering(name, t)
                 changes.append([overlap(picture, plain, mask, value, band) for value in thresholds])
         if changes:
             views.append([np.mean(opaque) if opaque else np.nan, *np.mean(changes, axis=0)])
     if not views:
-        raise SplashbenchError(f"{scene.name}: no test view has a frame with {_LEAST_PIXELS} mask pixels")
+        least = PROTOCOL_V1.min_mask_pixels
+        raise SplashbenchError(f"{scene.name}: no test view has a frame with {least} mask pixels")
     return np.asarray(np.mean(views, axis=0))
-
-
-def opened(path: Path, scene: Scene) -> Submission:
-    """The submission at `path`, which has to be of all timesteps of `scene`."""
-    submission = Submission.open(path)
-    require_same_scene(scene, submission)
-    if submission.status is not Status.OK:
-        raise SplashbenchError(f"{path}: the run ended with status {submission.status.value}; run it again")
-    if submission.identity.withheld is not None:
-        raise SplashbenchError(f"{path} has withheld timesteps; give one without")
-    return submission
 
 
 def table(
@@ -132,7 +120,9 @@ def main() -> int:
     try:
         scene, empty = Scene.open(options.scene), Submission.open(options.reference)
         require_reference(scene, empty)
-        submissions = [opened(path, scene) for path in options.submissions]
+        submissions = [Submission.open(path) for path in options.submissions]
+        for submission in submissions:
+            require_complete(scene, submission)
         text = table(scene, submissions, empty, options.thresholds, options.band, options.every)
         print(text, end="")
         if options.out:

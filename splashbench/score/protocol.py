@@ -141,6 +141,16 @@ def require_reference(scene: Scene, reference: Any) -> None:
     require_same_scene(scene, reference, "reference")
 
 
+def require_complete(scene: Scene, submission: Any) -> None:
+    """Raise SplashbenchError unless `submission` is a finished one for `scene`, fitted to all of its timesteps."""
+    require_same_scene(scene, submission)
+    status = _text(submission.status)
+    if status != _OK:
+        raise SplashbenchError(f"{submission.directory}: the run ended with status {status}; run it again")
+    if submission.identity.withheld is not None:
+        raise SplashbenchError(f"{submission.directory} has withheld timesteps; give one without")
+
+
 def _costs(record: Any) -> dict[str, MetricValue]:
     """What the harness measured; the method has no say in it. A frame rate from few frames is none."""
     costs = {

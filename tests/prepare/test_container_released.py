@@ -17,7 +17,7 @@ from splashbench.cli.main import main
 from splashbench.files import read_gray, read_image, write_png
 from splashbench.prepare.container.check import intersection_over_union, silhouette
 from splashbench.scene import Scene
-from splashbench.scene.container import ContainerMesh, read_mesh
+from splashbench.scene.container import ContainerMesh
 
 
 def mug() -> ContainerMesh:
@@ -69,7 +69,7 @@ def place(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
     assert main(["scene", "place", *map(str, words)]) == 1
-    said = capsys.readouterr().err.strip().splitlines()
+    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("placing")]
     assert len(said) == 1
     return said[0]
 
@@ -166,4 +166,3 @@ def test_another_mesh_is_refused_and_nothing_written(
     (released / "container.ply").write_bytes(b"somebody's")
     assert "is there already" in refused(capsys, released, rod)
     assert (released / "container.ply").read_bytes() == b"somebody's"
-    assert read_mesh(rod).is_closed

@@ -18,6 +18,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import files_together, require_folder_place, write_model
 from splashbench.prepare.container.check import Projection, overlay, verify
 from splashbench.prepare.container.placement import Axis, Placement, place_by_silhouettes, up_from_container
+from splashbench.prepare.container.stage import name_in_scene
 from splashbench.scene import Scene
 from splashbench.scene.container import FORMATS, ContainerMesh
 from splashbench.scene.layout import SceneMeta, plain_name
@@ -106,10 +107,10 @@ def _masks(scene: Scene, masked: Scene) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
-def name_in_scene(scene: Scene, mesh_file: Path, replace: bool) -> str:
-    """What the mesh's file is to be called in the scene's folder.
+def require_container_place(scene: Scene, mesh_file: Path, replace: bool) -> None:
+    """Raise SplashbenchError, before long work, unless `mesh_file` may become the scene's container.
 
-    Raises SplashbenchError, before long work, for a file of no format that scenes have, for a scene whose folder may
+    For a file of no format that scenes have, for a scene whose folder may
     not be written, and where a container is there already, unless it is to be replaced.
     """
     if mesh_file.suffix.lower() not in FORMATS:
@@ -119,10 +120,9 @@ def name_in_scene(scene: Scene, mesh_file: Path, replace: bool) -> str:
     require_folder_place(scene.directory)
     if not replace and scene.meta is not None and scene.meta.container_mesh is not None:
         raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace places it anew")
-    name = f"container{mesh_file.suffix.lower()}"
-    if not replace and (scene.directory / name).exists():
-        raise SplashbenchError(f"{scene.directory / name} is there already; move it away, or --replace to replace it")
-    return name
+    path = scene.directory / name_in_scene(mesh_file)
+    if not replace and path.exists():
+        raise SplashbenchError(f"{path} is there already; move it away, or --replace to replace it")
 
 
 def write_placement(
@@ -132,7 +132,8 @@ def write_placement(
 
     Other fields there stay. Gravity and scale that it stated stay, too, unless `replace`.
     """
-    name = name_in_scene(scene, mesh_file, replace)
+    require_container_place(scene, mesh_file, replace)
+    name = name_in_scene(mesh_file)
     known = scene.meta or SceneMeta(name=plain_name(scene.name))
     said = {"container_mesh": name, "container_pose": found.placement.pose.tolist()}
     said |= {} if known.gravity and not replace else {"gravity": found.gravity}
