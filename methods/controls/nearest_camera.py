@@ -12,11 +12,11 @@ from typing import ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from splashbench_methods.scaffold_gs.depth import look_at
-from splashbench_methods.scaffold_gs.sweep import for_opencv, plane_homography
 
 from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.files import write_json
+from splashbench.plates.depth import look_at
+from splashbench.plates.sweep import for_opencv, plane_homography
 from splashbench.scene import Camera, Particles, TrainingScene
 
 

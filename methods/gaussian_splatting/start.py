@@ -18,11 +18,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from splashbench_methods.scaffold_gs.anchors import seed_anchors, sparse_anchors
-from splashbench_methods.scaffold_gs.plate import make_plate
 
 from splashbench.adapter.contract import Run
 from splashbench.errors import SplashbenchError
 from splashbench.observe.initial_points import initial_points
+from splashbench.plates.plate import make_plate
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import TrainingScene
 

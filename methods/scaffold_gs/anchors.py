@@ -1,8 +1,8 @@
 """Where the anchors start: the scene's sparse points, or every training view's pixels lifted to their depth.
 
 Sparse points are merged on voxels as in Scaffold-GS, `unique(round(p / voxel)) voxel` (Lu et al. 2024, Eq. 4). Pixels
-on a regular grid are lifted to the depth that depth.py gives, and all views' points are merged likewise, each anchor at
-the mean of its points.
+on a regular grid are lifted to the depth that splashbench/plates gives, and all views' points are merged likewise, each
+anchor at the mean of its points.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from splashbench_methods.scaffold_gs.depth import DepthMap, depth_maps, guessed, interpolated, lift
-from splashbench_methods.scaffold_gs.plate import Plate
+
+from splashbench.plates.depth import DepthMap, depth_maps, guessed, interpolated, lift
+from splashbench.plates.plate import Plate
 
 # Lifted points per anchor kept: voxels merge what several views see.
 _OVERSAMPLING = 3.0
@@ -58,7 +59,7 @@ def seed_anchors(
     """At most `count` anchors from sparse points [N, 6 or more] (x y z r g b ...), or None, and the training plates."""
     pixels = sum(plate.camera.width * plate.camera.height for plate in plates)
     stride = max(1.0, float(np.sqrt(pixels / (_OVERSAMPLING * count))))
-    maps = depth_maps(points, plates) or [None] * len(plates)
+    maps: list[DepthMap] | list[None] = depth_maps(points, plates) or [None] * len(plates)
     lifted = [_lift(points, plate, depth, plates, stride, rng) for plate, depth in zip(plates, maps)]
     positions = np.concatenate([xyz for xyz, _ in lifted])
     colors = np.concatenate([rgb for _, rgb in lifted])

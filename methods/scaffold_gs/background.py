@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench_methods.scaffold_gs.fitting import fit_model, supervised_anchors
 from splashbench_methods.scaffold_gs.model import AnchorModel, Variant, to_arrays
-from splashbench_methods.scaffold_gs.plate import MAX_FRAMES, Plate, make_plate
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
 from splashbench.adapter.contract import Run
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, read_npz
+from splashbench.plates.plate import MAX_FRAMES, Plate, make_plate
 from splashbench.render import rasterize_arrays
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, TrainingScene

@@ -17,10 +17,10 @@ from splashbench_methods.scaffold_gs.anchors import AnchorSeed
 from splashbench_methods.scaffold_gs.growth import Growth
 from splashbench_methods.scaffold_gs.model import PER_ANCHOR, AnchorModel, Variant
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
-from splashbench_methods.scaffold_gs.plate import Plate, shrunk
 from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
 from splashbench.errors import SplashbenchError
+from splashbench.plates.plate import Plate, shrunk
 from splashbench.render import rasterize
 from splashbench.render.ssim import SsimTarget, ssim
 

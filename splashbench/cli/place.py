@@ -74,23 +74,20 @@ def _positive(text: str) -> float:
 
 def place(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene place`."""
-    from splashbench.errors import SplashbenchError
-    from splashbench.files import require_file_place, write_png
-    from splashbench.prepare.container.released import picture, place_in_scene, require_container_place, write_placement
+    from splashbench.files import write_png
+    from splashbench.prepare.container.entry import picture, require_picture
+    from splashbench.prepare.container.released import place_in_scene, require_container_place, write_placement
     from splashbench.scene import Scene
     from splashbench.scene.container import read_mesh
 
     scene = Scene.open(arguments.scene)
     require_container_place(scene, arguments.mesh, arguments.replace)
-    if arguments.picture is not None:
-        if arguments.picture.suffix.lower() != ".png":
-            raise SplashbenchError(f"{arguments.picture}: the picture is a PNG; give a name that ends in .png")
-        require_file_place(arguments.picture)
+    require_picture(arguments.picture)
     mesh = read_mesh(arguments.mesh)
     masked = None if arguments.masks is None else Scene.open(arguments.masks)
     say("placing the mesh by its masks")
     found = place_in_scene(scene, mesh, masked, arguments.up, arguments.metres_per_unit)
-    drawn = None if arguments.picture is None else picture(scene, mesh, found)
+    drawn = None if arguments.picture is None else picture(scene, mesh, found.placement.pose)
     meta = write_placement(scene, arguments.mesh, found, arguments.transparent, arguments.replace)
     if drawn is not None:
         write_png(arguments.picture, drawn)

@@ -1,4 +1,4 @@
-"""`splashbench scene check|info|export|place`: look a scene over, write it for others, say where its container is."""
+"""`splashbench scene check|info|export|place|container`: look a scene over, write it for others, put a container in."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from splashbench.cli import place
+from splashbench.cli import container, place
 from splashbench.cli.output import add_json, emit, say
 
 _EPILOG = """\
@@ -15,6 +15,7 @@ examples:
   splashbench scene check scenes/bowl_001           every file is read; every fault is listed
   splashbench scene export scenes/bowl_001 NeRF/bowl_001 --format nerfies
   splashbench scene place scenes/bowl_001 bowl_001.glb
+  splashbench scene container scenes/bowl_001
 """
 
 _EXPORT_EPILOG = """\
@@ -41,7 +42,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    actions = parser.add_subparsers(dest="action", metavar="check|info|export|place", required=True)
+    actions = parser.add_subparsers(dest="action", metavar="check|info|export|place|container", required=True)
     for name, help_text, handler in (
         ("check", "read every file and list every fault", check),
         ("info", "cameras, sizes, times, what is known and unknown", info),
@@ -58,6 +59,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         action.set_defaults(handler=handler)
     _register_export(actions)
     place.register(actions)
+    container.register(actions)
 
 
 def _register_export(actions: argparse._SubParsersAction) -> None:

@@ -14,8 +14,8 @@ from splashbench_methods.scaffold_gs.fitting import fit_model
 from splashbench_methods.scaffold_gs.growth import Growth
 from splashbench_methods.scaffold_gs.model import AnchorModel, Gaussians, Variant
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
-from splashbench_methods.scaffold_gs.plate import Plate
 
+from splashbench.plates.plate import Plate
 from splashbench.render import rasterize
 from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera

@@ -11,11 +11,11 @@ import torch
 from splashbench_methods.gaussian_splatting.losses import l1
 from splashbench_methods.gaussian_splatting.splats import rotation_matrices
 from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
-from splashbench_methods.scaffold_gs.depth import depth_maps, look_at
 from splashbench_methods.scaffold_gs.fitting import pyramid
 from splashbench_methods.scaffold_gs.model import AnchorModel, Variant
-from splashbench_methods.scaffold_gs.plate import Plate, make_plate, masked_median
 
+from splashbench.plates.depth import depth_maps, look_at
+from splashbench.plates.plate import Plate, make_plate, masked_median
 from splashbench.scene import Camera
 
 

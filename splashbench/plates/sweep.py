@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from splashbench_methods.scaffold_gs.plate import Plate
 
+from splashbench.plates.plate import Plate
 from splashbench.scene import Camera
 
 PLANES = 96

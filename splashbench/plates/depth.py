@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from splashbench_methods.scaffold_gs.plate import Plate, shrunk
-from splashbench_methods.scaffold_gs.sweep import PLANES, inverse_depth
 
+from splashbench.plates.plate import Plate, shrunk
+from splashbench.plates.sweep import PLANES, inverse_depth
 from splashbench.scene import Camera
 
 # The sweep sees plates of at most this size; anchors are some pixels apart anyway.

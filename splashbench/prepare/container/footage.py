@@ -1,0 +1,233 @@
+"""The container's surface from the footage itself, where nobody has scanned it.
+
+An opaque container hides liquid from the views behind its wall, and to carve away what such a view does not show is the
+largest single error of a hull. To know what is hidden takes no scan, only how deep the wall lies. The plates' depths
+(splashbench/plates) are fused on a grid within the container masks as a truncated signed distance (Curless and Levoy
+1996): a node in front of a view's depth is free, one a little way behind it is not, and one outside a mask is free.
+What no view shows counts as free, so that nothing is hidden by a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.measure import marching_cubes
+
+from splashbench.errors import SplashbenchError
+from splashbench.observe import Bounds, Grid
+from splashbench.observe.container import depth_image
+from splashbench.plates.depth import DepthMap, depth_maps
+from splashbench.plates.plate import make_plate
+from splashbench.prepare.container.check import Projection, overlay, verify
+from splashbench.prepare.container.entry import (
+    LEAST_OVERLAP,
+    in_pairs,
+    known_of,
+    masks_of,
+    require_place,
+    write_entry,
+)
+from splashbench.progress import track
+from splashbench.scene import Camera, Scene
+from splashbench.scene.container import ContainerMesh
+from splashbench.scene.layout import SceneMeta
+
+# Plates of this size are swept.
+_SIDE = 400
+# Cells along the longest side of the grid.
+_CELLS = 128
+# Distances in front of a view's depth count up to so many cells.
+_FRONT = 2.5
+# So many cells behind it a view says that there is something: a wall thinner than that is thinned by the views of its
+# other side. Less leaves holes where the views' depths disagree.
+_BEHIND = 11.0
+_SMOOTHING = 0.6
+# What a depth that no other view confirms counts beside one that is confirmed.
+_DOUBTED = 0.15
+# The grid reaches beyond the confirmed points, of which so many on either end may be wrong.
+_OUTLIERS = 0.02
+_MARGIN = 0.4
+_LEAST_POINTS = 100
+# Pieces smaller than this share of the largest are errors of the depth.
+_LEAST_PIECE = 0.02
+
+
+# Less of the masks than this is a piece of the container, or an error.
+_LEAST_COVER = 0.6
+_REMEDY = "without texture it takes a scan (`splashbench scene place`)"
+#: The mesh's file in a scene's folder. Not the name that a scan gets, so that --replace overwrites none.
+FILE = "container_from_footage.ply"
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A container from the footage.
+
+    Attributes:
+        mesh: scene units.
+        projections: how it and the mask agree in each camera that has one, held-out ones too.
+    """
+
+    mesh: ContainerMesh
+    projections: dict[str, Projection]
+
+    def doubtful(self) -> list[str]:
+        """Cameras in which mesh and mask overlap too little."""
+        return [name for name, projection in self.projections.items() if projection.iou < LEAST_OVERLAP]
+
+
+def write_reconstruction(scene: Scene, found: Reconstruction, replace: bool = False) -> SceneMeta:
+    """Write the mesh into the scene's folder and name it in scene.json; returns what stands there. Other fields stay.
+
+    Raises SplashbenchError as `require_place` does.
+    """
+    require_place(scene, FILE, replace)
+    mesh = trimesh.Trimesh(found.mesh.vertices.astype(np.float32), found.mesh.faces, process=False)
+    provenance = known_of(scene).provenance | {"container": "reconstructed from the footage"}
+    said = {"container_transparent": False, "provenance": provenance}
+    return write_entry(scene, FILE, lambda path: path.write_bytes(mesh.export(file_type="ply")), np.eye(4), said)
+
+
+@dataclass(frozen=True)
+class _View:
+    """What one training view says: its container mask (of camera `outline`) and the depth of its plate."""
+
+    outline: Camera
+    mask: NDArray[np.bool_]
+    depth: DepthMap
+    seen: NDArray[np.bool_]
+
+    def within(self, points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Whether points [N, 3] project into the mask, and whether beside it; neither beyond the image."""
+        rows, columns, inside = _pixels(self.outline, points)
+        on_mask = self.mask[rows, columns]
+        return inside & on_mask, inside & ~on_mask
+
+    def distances(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How far points [N, 3] lie in front of what the view shows, scene units, and how much that counts."""
+        rows, columns, inside = _pixels(self.depth.camera, points)
+        camera = self.depth.camera
+        away = points @ camera.w2c[2, :3] + camera.w2c[2, 3]
+        weight = np.where(self.depth.trusted[rows, columns], 1.0, _DOUBTED)
+        return 1.0 / self.depth.inverse[rows, columns] - away, weight * (inside & self.seen[rows, columns])
+
+    def confirmed(self) -> NDArray[np.float64]:
+        """Points [N, 3] of the plate within the mask, as deep as another view confirms."""
+        points = self.depth.lifted()[self.depth.trusted & self.seen]
+        return points[self.within(points)[0]]
+
+
+def _pixels(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray]:
+    """Rows and columns (within the image) at which points [N, 3] are seen, and whether they are of the image."""
+    uv, depth = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    column, row = np.where(inside[:, None], uv, 0).astype(np.int64).T
+    return row, column, inside
+
+
+def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconstruction:
+    """What the training views show of the container; test views take no part.
+
+    masked: the scene before it was cropped, of the same cameras, which has the container masks; None for `scene`.
+
+    Raises SplashbenchError where fewer than two training cameras have a mask, and where too few pixels within the masks
+    have a depth that two views agree on: a container without texture, or one that is seen through.
+    """
+    masks, outlines = masks_of(scene, masked)
+    training = scene.training()
+    # All views are swept: those without a mask confirm the others' depths.
+    plates = [make_plate(training, name, _SIDE) for name in track(training.train, "collecting what stands still")]
+    maps = depth_maps(training.initial_points(), plates)
+    views = [
+        _View(outlines[name], masks[name], depth, plate.seen)
+        for name, depth, plate in zip(training.train, maps, plates)
+        if name in masks
+    ]
+    confirmed = np.concatenate([view.confirmed() for view in views])
+    if len(confirmed) < _LEAST_POINTS:
+        raise SplashbenchError(
+            f"{scene.directory}: the views agree on the depth of {len(confirmed)} pixels of the container,"
+            f" {_LEAST_POINTS} are needed; {_REMEDY}"
+        )
+    low, high = np.quantile(confirmed, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+    mesh = _surface(Grid.over(Bounds(low, high).padded(_MARGIN), _CELLS), views, scene)
+    projections = verify(mesh, np.eye(4), list(outlines.values()), masks)
+    overlap = float(np.median([projections[name].iou for name in masks if name in scene.train]))
+    if overlap < _LEAST_COVER:
+        raise SplashbenchError(
+            f"{scene.directory}: the surface found covers {overlap:.2f} of the container masks (intersection over"
+            f" union, median of the training views), {_LEAST_COVER} are needed; {_REMEDY}"
+        )
+    return Reconstruction(mesh, projections)
+
+
+def _surface(grid: Grid, views: list[_View], scene: Scene) -> ContainerMesh:
+    field = np.stack([_fused(points, grid.voxel, views) for points in _slabs(grid)])
+    field = ndimage.gaussian_filter(field, _SMOOTHING, mode="nearest")
+    pieces, count = ndimage.label(field < 0)
+    if count:
+        sizes = np.bincount(pieces.ravel())[1:]
+        small = np.flatnonzero(sizes < _LEAST_PIECE * sizes.max()) + 1
+        field[np.isin(pieces, small)] = 1.0
+    if not (field < 0).any():
+        raise SplashbenchError(f"{scene.directory}: the views' depths make no surface; {_REMEDY}")
+    # Closed at the grid's faces.
+    field = np.pad(field, 1, constant_values=1.0)
+    vertices, faces, _, _ = marching_cubes(field, 0.0)
+    return ContainerMesh(grid.to_scene(vertices - 1), faces[:, ::-1])
+
+
+def _slabs(grid: Grid) -> Iterator[NDArray[np.float64]]:
+    """The grid's nodes, [ny, nz, 3] at a time: all at once would take hundreds of megabytes."""
+    nx, ny, nz = grid.shape
+    plane = np.stack(np.meshgrid(0, np.arange(ny), np.arange(nz), indexing="ij"), axis=-1)[0]
+    for i in track(range(nx), "fusing depths"):
+        yield grid.to_scene(plane + np.array([i, 0, 0]))
+
+
+def _fused(points: NDArray[np.float64], voxel: float, views: list[_View]) -> NDArray[np.float64]:
+    """The truncated signed distance at points [ny, nz, 3], in [-1, 1]: positive where it is free."""
+    flat = points.reshape(-1, 3)
+    total, weights, free = np.zeros(len(flat)), np.zeros(len(flat)), np.zeros(len(flat), bool)
+    for view in views:
+        within, beside = view.within(flat)
+        distance, weight = view.distances(flat)
+        weight = weight * (within & (distance > -_BEHIND * voxel))
+        total += weight * np.clip(distance / (_FRONT * voxel), -1, 1)
+        weights += weight
+        free |= beside
+    known = (weights > 0) & ~free
+    return np.where(known, total / np.where(known, weights, 1), 1.0).reshape(points.shape[:2])
+
+
+def picture(scene: Scene, mesh: ContainerMesh, width: int = 480) -> NDArray[np.uint8]:
+    """To judge by eye, a row per camera: the first image with the mesh's outline, the mesh lit from the camera.
+
+    RGB uint8 [H, W, 3].
+    """
+    shown = []
+    for name, camera in scene.cameras.items():
+        small = camera.scaled(width / camera.width)
+        shown.append(overlay(mesh, np.eye(4), camera, image=scene.image(name, 0), width=small.width))
+        shown.append(_lit(depth_image(mesh, small), small))
+    return in_pairs(shown)
+
+
+def _lit(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
+    """A surface of this depth [H, W], lit from the camera: grey where there is one, black elsewhere."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
+    points = rays * np.where(np.isfinite(depth), depth, np.nan)[..., None]
+    normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    towards = -np.einsum("hwc,hwc->hw", normals, rays)
+    length = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        light = np.nan_to_num(np.abs(towards) / length)
+    grey = np.clip(40 + 215 * light, 0, 255) * np.isfinite(depth)
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1)
