@@ -55,8 +55,6 @@ _MARGIN = 0.4
 _LEAST_POINTS = 100
 # Pieces smaller than this share of the largest are errors of the depth.
 _LEAST_PIECE = 0.02
-
-
 # Less of the masks than this is a piece of the container, or an error.
 _LEAST_COVER = 0.6
 _REMEDY = "without texture it takes a scan (`splashbench scene place`)"
