@@ -32,7 +32,12 @@ def register(actions: argparse._SubParsersAction) -> None:
     action.add_argument(
         "--masks", type=Path, metavar="SCENE", help="the scene before it was cropped, which has the container masks"
     )
-    action.add_argument("--picture", type=Path, metavar="PNG", help="draw outline and depth for every camera")
+    action.add_argument(
+        "--picture",
+        type=Path,
+        metavar="PNG",
+        help="draw every camera's image with its outline, its surface beside",
+    )
     action.add_argument("--replace", action="store_true", help="replace the container that scene.json names")
     add_json(action)
     action.set_defaults(handler=reconstruct)
@@ -43,7 +48,7 @@ def reconstruct(arguments: argparse.Namespace) -> int:
     from splashbench.errors import SplashbenchError
     from splashbench.files import write_png
     from splashbench.prepare.container.entry import require_picture, require_place
-    from splashbench.prepare.container.footage import FILE, container_from_footage, picture, write_reconstruction
+    from splashbench.prepare.container.footage import container_from_footage, picture, write_reconstruction
     from splashbench.scene import Scene
 
     scene = Scene.open(arguments.scene)
@@ -52,19 +57,20 @@ def reconstruct(arguments: argparse.Namespace) -> int:
             f"{scene.directory / 'scene.json'}: the container is transparent; it hides nothing, and its depth cannot be"
             " seen; place a scan (`splashbench scene place`)"
         )
-    require_place(scene, FILE, arguments.replace)
+    require_place(scene, None, arguments.replace)
     require_picture(arguments.picture)
     masked = None if arguments.masks is None else Scene.open(arguments.masks)
+    say(f"reconstructing the container from {len(scene.train)} training views")
     found = container_from_footage(scene, masked)
-    drawn = None if arguments.picture is None else picture(scene, found.mesh)
-    write_reconstruction(scene, found, arguments.replace)
+    drawn = None if arguments.picture is None else picture(scene, found.placed)
+    path = write_reconstruction(scene, found, arguments.replace)
     if drawn is not None:
         write_png(arguments.picture, drawn)
     if arguments.json:
         emit(
             {
                 "scene": str(scene.directory),
-                "mesh": str(scene.directory / FILE),
+                "mesh": str(path),
                 "faces": len(found.mesh.faces),
                 "overlap": {name: projection.iou for name, projection in found.projections.items()},
                 "doubtful": found.doubtful(),
@@ -75,5 +81,7 @@ def reconstruct(arguments: argparse.Namespace) -> int:
         say(f"camera {name}{held_out}: surface and mask overlap {projection.iou:.3f}")
     if found.doubtful():
         say(f"note: little overlap in camera {', '.join(found.doubtful())}; look at --picture before you trust it")
-    say(f"wrote {scene.directory / FILE}, {len(found.mesh.faces)} triangles, and scene.json; run methods again")
+    if scene.container_transparent is None:
+        say("note: it was taken to be opaque; a container that is seen through needs a scan")
+    say(f"wrote {path}, {len(found.mesh.faces)} triangles, and scene.json; run methods again")
     return 0

@@ -3,7 +3,8 @@
 Structure from motion gives one to a few thousand points, few of them on smooth surfaces, so a container may have none.
 The sweep (sweep.py) sees its edges. Where a sweep is not confirmed by another view's, a plane's inverse depth being an
 affine function of the pixel, each view's inverse depth is fitted affinely to the sparse points around a pixel. Without
-sparse points, depths are drawn at random: most within the space that all training cameras look at, the rest far behind.
+sparse points a background's anchors draw depths at random (`guessed`): most within the space that all training cameras
+look at, the rest far behind.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from splashbench.plates.plate import Plate, shrunk
 from splashbench.plates.sweep import PLANES, inverse_depth
 from splashbench.scene import Camera
 
-# The sweep sees plates of at most this size; anchors are some pixels apart anyway.
-_SWEEP_SIDE = 400
+#: The sweep sees plates of at most this size, in pixels.
+SWEEP_SIDE = 400
 # Two sweeps agree when their inverse depths differ by at most so many planes.
 _TOLERANCE_PLANES = 1.0
 # Sparse points only say roughly how near and far a scene reaches.
@@ -73,7 +74,7 @@ def depth_maps(points: NDArray[np.float32] | None, plates: list[Plate]) -> list[
     """Sweep all plates; points: sparse points [N, 3 or more], or None. Empty with fewer than two plates."""
     if len(plates) < 2:
         return []
-    plates = [shrunk(plate, _SWEEP_SIDE) for plate in plates]
+    plates = [shrunk(plate, SWEEP_SIDE) for plate in plates]
     cameras = [plate.camera for plate in plates]
     priors = [None if points is None else _prior(points[:, :3], camera) for camera in cameras]
     low, high = _inverse_range(priors, cameras)

@@ -2,7 +2,7 @@
 
 The paper fits its background to frame 0. Liquid already in that frame would be baked in, or, masked, leave the pixels
 under it without evidence. The median over the frames in which a pixel is free of liquid uses more of the recording;
-pixels that are never free carry no loss.
+pixels that are never free are marked.
 """
 
 from __future__ import annotations

@@ -7,17 +7,18 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from scipy.ndimage import map_coordinates
 
 from splashbench.cli.main import main
-from splashbench.files import read_image, write_png
-from splashbench.observe.container import depth_image, hidden
+from splashbench.files import read_gray, read_image, write_png
+from splashbench.observe import Bounds, Grid
+from splashbench.observe.container import depth_image, hidden, solid_distance
 from splashbench.prepare.container.check import silhouette
-from splashbench.prepare.container.footage import FILE
-from splashbench.scene import Camera, Scene
+from splashbench.scene import Camera, Scene, SceneMeta, write_scene
 from splashbench.scene.container import ContainerMesh
 from splashbench.synth.balls import write_balls_scene
 
@@ -69,11 +70,11 @@ def textured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def mesh_bytes(textured: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The mesh's file of the textured scene."""
-    done = Path(shutil.copytree(textured, tmp_path_factory.mktemp("done") / "bowl"))
-    assert main(["scene", "container", str(done)]) == 0
-    return (done / FILE).read_bytes()
+def done(textured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The textured scene with its container; read-only."""
+    folder = Path(shutil.copytree(textured, tmp_path_factory.mktemp("done") / "bowl"))
+    assert main(["scene", "container", str(folder)]) == 0
+    return folder
 
 
 @pytest.fixture
@@ -92,8 +93,14 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
     assert main(["scene", "container", *map(str, words)]) == 1
     said = capsys.readouterr().err.splitlines()
+    said = [line for line in said if not line.startswith("reconstructing")]
     assert len(said) == 1
     return said[0]
+
+
+def mesh_file(folder: Path) -> Path:
+    (path,) = folder.glob("container*.ply")
+    return path
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -123,34 +130,93 @@ def test_the_views_show_where_the_container_is_and_what_it_hides(
         assert 0.2 < truly.mean() < 0.8
         assert np.mean(told == truly) > 0.9
     # A row a camera, the image beside the surface.
-    assert read_image(tmp_path / "p.png").shape == (7 * 320, 2 * 480, 3)
+    assert read_image(tmp_path / "p.png").shape == (7 * 160, 2 * 240, 3)
     after = everything(scene)
-    assert set(after) == set(before) | {FILE}
+    assert set(after) == set(before) | {mesh_file(scene).name}
+    assert said["mesh"] == str(mesh_file(scene))
     assert [name for name in before if before[name] != after[name]] == ["scene.json"]
     described, was = json.loads(after["scene.json"]), json.loads(before["scene.json"])
     changed = {key for key in described if described[key] != was[key]}
-    assert changed == {"container_mesh", "container_pose", "container_transparent", "provenance"}
-    assert described["provenance"]["container"] == "reconstructed from the footage"
+    assert changed == {"container_mesh", "container_pose", "container_transparent"}
     assert (described["container_transparent"], described["times"]) == (False, was["times"])
 
 
-def test_test_views_take_no_part(scene: Path, mesh_bytes: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_free_to_see_is_no_wall(done: Path) -> None:
+    mesh = Scene.open(done).container_mesh()
+    assert mesh is not None
+    grid = Grid.over(Bounds(np.array([-0.36, 0.0, -0.36]), np.array([0.36, 0.28, 0.36])), 72)
+    found, true = solid_distance(mesh, grid), solid_distance(bowl(), grid)
+    across = np.hypot(grid.nodes()[..., 0], grid.nodes()[..., 2])
+    hollow = (true > 2) & (across < 0.13)
+    assert hollow.sum() > 5000
+    assert np.mean(found[hollow] < 0) < 0.05
+    assert np.mean(found[true < -1] < 0) > 0.3
+
+
+def test_a_released_scene_stays_one(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # A folder with a real scene's name and without a scene.json is taken for the release's.
+    released = Path(shutil.copytree(scene, tmp_path / "bowl_001"))
+    (released / "scene.json").unlink()
+    assert Scene.open(released).is_released
+    capsys.readouterr()
+    assert main(["scene", "container", str(released)]) == 0
+    assert "taken to be opaque" in capsys.readouterr().err
+    assert Scene.open(released).is_released
+
+
+def test_test_views_take_no_part(scene: Path, done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     noise = np.random.default_rng(2)
     for name in Scene.open(scene).test:
         for path in [*(scene / "ims" / name).iterdir(), scene / "container_mask" / f"{name}.png"]:
             write_png(path, noise.integers(0, 256, read_image(path).shape, dtype=np.uint8)[..., 0])
     said = reconstruct(capsys, scene)
-    assert (scene / FILE).read_bytes() == mesh_bytes
+    assert mesh_file(scene).read_bytes() == mesh_file(done).read_bytes()
     assert said["doubtful"] == ["6", "7"]
 
 
 def test_a_cropped_scene_takes_the_masks_of_the_whole_one(
-    scene: Path, mesh_bytes: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bare = Path(shutil.copytree(scene, tmp_path / "bare", ignore=shutil.ignore_patterns("container_mask")))
-    assert "name the scene before it was cropped by --masks" in refused(capsys, bare)
-    reconstruct(capsys, bare, "--masks", scene)
-    assert (bare / FILE).read_bytes() == mesh_bytes
+    whole = Scene.open(scene)
+    windows = {name: (20 + i, 10 + 2 * i, 190, 130) for i, name in enumerate(whole.cameras)}
+    cropped = tmp_path / "cropped"
+
+    def cut(name: str, pixels: np.ndarray) -> np.ndarray:
+        x, y, width, height = windows[name]
+        return pixels[y : y + height, x : x + width]
+
+    write_scene(
+        cropped,
+        cameras={name: camera.cropped(*windows[name]) for name, camera in whole.cameras.items()},
+        train=whole.train,
+        test=whole.test,
+        n_frames=whole.n_frames,
+        frames=(
+            (name, t, cut(name, whole.image(name, t)), cut(name, whole.mask(name, t)))
+            for name in whole.cameras
+            for t in range(whole.n_frames)
+        ),
+        meta=SceneMeta(name="cropped", times=list(whole.times)),
+    )
+    assert "name the scene before it was cropped by --masks" in refused(capsys, cropped)
+    said = reconstruct(capsys, cropped, "--masks", scene)
+    assert min(said["overlap"].values()) > 0.85
+    mesh = Scene.open(cropped).container_mesh()
+    assert mesh is not None
+    for camera in whole.cameras.values():
+        true, here = depth_image(bowl(), camera), depth_image(mesh, camera)
+        both = np.isfinite(true) & np.isfinite(here)
+        assert np.median(np.abs(here[both] - true[both])) < NEAR
+
+
+def test_a_mask_without_outline_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = scene / "container_mask" / "3.png"
+    for value, word in ((0, "empty"), (255, "full")):
+        write_png(path, np.full((160, 240), value, np.uint8))
+        assert f"3.png: the mask is {word}" in refused(capsys, scene)
+    for name in "2345":
+        (scene / "container_mask" / f"{name}.png").unlink()
+    assert "1 of the training cameras" in refused(capsys, scene)
 
 
 def test_what_cannot_be_seen_is_refused_and_nothing_changes(
@@ -158,14 +224,19 @@ def test_what_cannot_be_seen_is_refused_and_nothing_changes(
 ) -> None:
     plain = write_bowl_scene(tmp_path / "plain", None)
     before = everything(plain)
-    assert "without texture it takes a scan" in refused(capsys, plain)
+    assert "a container without texture" in refused(capsys, plain)
     assert "ends in .png" in refused(capsys, plain, "--picture", "picture")
     assert everything(plain) == before
     described = json.loads((scene / "scene.json").read_text())
     (scene / "scene.json").write_text(json.dumps(described | {"container_transparent": True}))
     assert "the container is transparent" in refused(capsys, scene)
     (scene / "scene.json").write_text(json.dumps(described))
-    (scene / FILE).write_text("mine")
-    assert "--replace" in refused(capsys, scene)
-    reconstruct(capsys, scene, "--replace")
+    reconstruct(capsys, scene)
+    first, digest = mesh_file(scene), Scene.open(scene).digest
     assert "has a container already" in refused(capsys, scene)
+    mask = read_gray(scene / "container_mask" / "1.png")
+    write_png(scene / "container_mask" / "1.png", cv2.dilate(mask, np.ones((5, 5), np.uint8)))
+    reconstruct(capsys, scene, "--replace")
+    # Another mesh is another scene, and leaves no old file.
+    assert mesh_file(scene) != first
+    assert Scene.open(scene).digest != digest

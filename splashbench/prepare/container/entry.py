@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import files_together, require_file_place, require_folder_place, write_model
-from splashbench.prepare.container.check import overlay
+from splashbench.prepare.container.check import Projection, overlay
 from splashbench.scene import Camera, Scene
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.layout import SceneMeta, plain_name
 
-# Below this overlap of mesh and mask a camera is worth a look.
+#: Below this overlap of mesh and mask a camera is worth a look.
 LEAST_OVERLAP = 0.8
 # Extrinsics of the same camera, with and without a crop, agree to this.
 _SAME_POSE = 1e-6
@@ -27,7 +27,8 @@ def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArr
 
     masked: the scene before it was cropped, of the same cameras; None for `scene` itself.
 
-    Raises SplashbenchError for other cameras than the scene's, and where fewer than two training cameras have a mask.
+    Raises SplashbenchError for other cameras than the scene's, for a mask without or with nothing but container, and
+    where fewer than two training cameras have a mask.
     """
     masked = masked or scene
     found = {}
@@ -35,6 +36,11 @@ def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArr
         mask = masked.container_mask(name) if name in masked.cameras else None
         if mask is None:
             continue
+        if mask.all() or not mask.any():
+            path = masked.directory / "container_mask" / f"{name}.png"
+            raise SplashbenchError(
+                f"{path}: the mask is {'full' if mask.all() else 'empty'}; draw the container, or leave the file out"
+            )
         poses = scene.cameras[name].w2c, masked.cameras[name].w2c
         if not np.allclose(*poses, atol=_SAME_POSE * max(1.0, float(np.abs(poses[0]).max()))):
             raise SplashbenchError(
@@ -51,16 +57,23 @@ def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArr
     return found, {name: masked.cameras[name] for name in found}
 
 
-def require_place(scene: Scene, name: str, replace: bool) -> None:
+def doubtful(projections: Mapping[str, Projection]) -> list[str]:
+    """Cameras in which mesh and mask overlap too little."""
+    return [name for name, projection in projections.items() if projection.iou < LEAST_OVERLAP]
+
+
+def require_place(scene: Scene, name: str | None, replace: bool) -> None:
     """Raise SplashbenchError, before long work, unless file `name` may become the scene's container.
+
+    name: None where it is not known yet.
 
     For a scene whose folder may not be written, and where a container is there already, unless it is to be replaced.
     """
     require_folder_place(scene.directory)
     if not replace and scene.meta is not None and scene.meta.container_mesh is not None:
         raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace replaces it")
-    path = scene.directory / name
-    if not replace and path.exists():
+    path = scene.directory / (name or "")
+    if name is not None and not replace and path.exists():
         raise SplashbenchError(f"{path} is there already; move it away, or --replace to replace it")
 
 
@@ -74,7 +87,7 @@ def write_entry(
 ) -> SceneMeta:
     """Have `put` write the mesh's file, called `name`, and say in scene.json where it stands, and `said`.
 
-    Returns what stands there; other fields stay. Both files change, or neither.
+    Returns what stands there; other fields stay. Both are written before either takes its place.
     """
     entry = {"container_mesh": name, "container_pose": np.asarray(pose, np.float64).tolist()}
     meta = SceneMeta.model_validate({**known_of(scene).model_dump(), **entry, **said})

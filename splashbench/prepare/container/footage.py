@@ -3,14 +3,16 @@
 An opaque container hides liquid from the views behind its wall, and to carve away what such a view does not show is the
 largest single error of a hull. To know what is hidden takes no scan, only how deep the wall lies. The plates' depths
 (splashbench/plates) are fused on a grid within the container masks as a truncated signed distance (Curless and Levoy
-1996): a node in front of a view's depth is free, one a little way behind it is not, and one outside a mask is free.
-What no view shows counts as free, so that nothing is hidden by a guess.
+1996): for a view, a node in front of its depth is free and one a little way behind it is not, and the views' mean
+decides. A node outside a mask is free, and so is one of which no view speaks whose depth another view confirms.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -21,13 +23,12 @@ from skimage.measure import marching_cubes
 from splashbench.errors import SplashbenchError
 from splashbench.observe import Bounds, Grid
 from splashbench.observe.container import depth_image
-from splashbench.plates.depth import DepthMap, depth_maps
+from splashbench.plates.depth import SWEEP_SIDE, DepthMap, depth_maps
 from splashbench.plates.plate import make_plate
 from splashbench.prepare.container.check import Projection, overlay, verify
 from splashbench.prepare.container.entry import (
-    LEAST_OVERLAP,
+    doubtful,
     in_pairs,
-    known_of,
     masks_of,
     require_place,
     write_entry,
@@ -35,14 +36,11 @@ from splashbench.prepare.container.entry import (
 from splashbench.progress import track
 from splashbench.scene import Camera, Scene
 from splashbench.scene.container import ContainerMesh
-from splashbench.scene.layout import SceneMeta
 
-# Plates of this size are swept.
-_SIDE = 400
 # Cells along the longest side of the grid.
 _CELLS = 128
 # Distances in front of a view's depth count up to so many cells.
-_FRONT = 2.5
+_FRONT = 1.5
 # So many cells behind it a view says that there is something: a wall thinner than that is thinned by the views of its
 # other side. Less leaves holes where the views' depths disagree.
 _BEHIND = 11.0
@@ -57,9 +55,12 @@ _LEAST_POINTS = 100
 _LEAST_PIECE = 0.02
 # Less of the masks than this is a piece of the container, or an error.
 _LEAST_COVER = 0.6
-_REMEDY = "without texture it takes a scan (`splashbench scene place`)"
-#: The mesh's file in a scene's folder. Not the name that a scan gets, so that --replace overwrites none.
-FILE = "container_from_footage.ply"
+_REMEDY = (
+    "check masks and poses; a container without texture, or one that is seen through, takes a scan (`splashbench scene"
+    " place`)"
+)
+# Files are told apart by what they hold, so that scene.json, and with it the scene's digest, changes with the mesh.
+_FILE = "container_from_footage_{}.ply"
 
 
 @dataclass(frozen=True)
@@ -67,56 +68,80 @@ class Reconstruction:
     """A container from the footage.
 
     Attributes:
-        mesh: scene units.
+        mesh: relative to `origin`, so that its file keeps the precision, in scene units.
+        origin: [3], scene units.
         projections: how it and the mask agree in each camera that has one, held-out ones too.
     """
 
     mesh: ContainerMesh
+    origin: NDArray[np.float64]
     projections: dict[str, Projection]
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """Mesh to scene, [4, 4]."""
+        matrix = np.eye(4)
+        matrix[:3, 3] = self.origin
+        return matrix
+
+    @property
+    def placed(self) -> ContainerMesh:
+        """The mesh where it stands, scene units."""
+        return self.mesh.placed(self.pose)
 
     def doubtful(self) -> list[str]:
         """Cameras in which mesh and mask overlap too little."""
-        return [name for name, projection in self.projections.items() if projection.iou < LEAST_OVERLAP]
+        return doubtful(self.projections)
 
 
-def write_reconstruction(scene: Scene, found: Reconstruction, replace: bool = False) -> SceneMeta:
-    """Write the mesh into the scene's folder and name it in scene.json; returns what stands there. Other fields stay.
+def write_reconstruction(scene: Scene, found: Reconstruction, anew: bool = False) -> Path:
+    """Write the mesh into the scene's folder and name it in scene.json; returns its path. Other fields stay.
+
+    anew: whether a container may be there already; an earlier reconstruction's file goes.
 
     Raises SplashbenchError as `require_place` does.
     """
-    require_place(scene, FILE, replace)
     mesh = trimesh.Trimesh(found.mesh.vertices.astype(np.float32), found.mesh.faces, process=False)
-    provenance = known_of(scene).provenance | {"container": "reconstructed from the footage"}
-    said = {"container_transparent": False, "provenance": provenance}
-    return write_entry(scene, FILE, lambda path: path.write_bytes(mesh.export(file_type="ply")), np.eye(4), said)
+    content = mesh.export(file_type="ply")
+    name = _FILE.format(hashlib.sha256(content).hexdigest()[:8])
+    require_place(scene, name, anew)
+    write_entry(scene, name, lambda path: path.write_bytes(content), found.pose, {"container_transparent": False})
+    for path in scene.directory.glob(_FILE.format("*")):
+        if path.name != name:
+            path.unlink()
+    return scene.directory / name
 
 
 @dataclass(frozen=True)
 class _View:
-    """What one training view says: its container mask (of camera `outline`) and the depth of its plate."""
+    """What one training view says: its container mask, of `mask_camera`, and the depth of its plate.
 
-    outline: Camera
+    seen: bool [H, W], at the size of `depth`, what the plate shows.
+    """
+
+    mask_camera: Camera
     mask: NDArray[np.bool_]
     depth: DepthMap
     seen: NDArray[np.bool_]
 
     def within(self, points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Whether points [N, 3] project into the mask, and whether beside it; neither beyond the image."""
-        rows, columns, inside = _pixels(self.outline, points)
+        rows, columns, inside = _pixels(self.mask_camera, points)
         on_mask = self.mask[rows, columns]
         return inside & on_mask, inside & ~on_mask
 
-    def distances(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How far points [N, 3] lie in front of what the view shows, scene units, and how much that counts."""
-        rows, columns, inside = _pixels(self.depth.camera, points)
+    def distances(self, points: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.bool_], NDArray[np.bool_]]:
+        """How far points [N, 3] lie in front of what the view shows, scene units; whether it shows something there at
+        all, and whether another view confirms that."""
         camera = self.depth.camera
+        rows, columns, inside = _pixels(camera, points)
         away = points @ camera.w2c[2, :3] + camera.w2c[2, 3]
-        weight = np.where(self.depth.trusted[rows, columns], 1.0, _DOUBTED)
-        return 1.0 / self.depth.inverse[rows, columns] - away, weight * (inside & self.seen[rows, columns])
+        shown = inside & self.seen[rows, columns]
+        return 1.0 / self.depth.inverse[rows, columns] - away, shown, shown & self.depth.trusted[rows, columns]
 
     def confirmed(self) -> NDArray[np.float64]:
         """Points [N, 3] of the plate within the mask, as deep as another view confirms."""
-        points = self.depth.lifted()[self.depth.trusted & self.seen]
+        points = self.depth.lifted()[self.depth.trusted]
         return points[self.within(points)[0]]
 
 
@@ -137,48 +162,65 @@ def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconst
     Raises SplashbenchError where fewer than two training cameras have a mask, and where too few pixels within the masks
     have a depth that two views agree on: a container without texture, or one that is seen through.
     """
-    masks, outlines = masks_of(scene, masked)
+    masks, mask_cameras = masks_of(scene, masked)
+    where = (masked or scene).directory / "container_mask"
     training = scene.training()
     # All views are swept: those without a mask confirm the others' depths.
-    plates = [make_plate(training, name, _SIDE) for name in track(training.train, "collecting what stands still")]
+    plates = [make_plate(training, name, SWEEP_SIDE) for name in track(training.train, "collecting what stands still")]
     maps = depth_maps(training.initial_points(), plates)
     views = [
-        _View(outlines[name], masks[name], depth, plate.seen)
+        _View(mask_cameras[name], masks[name], depth, plate.seen)
         for name, depth, plate in zip(training.train, maps, plates)
         if name in masks
     ]
     confirmed = np.concatenate([view.confirmed() for view in views])
     if len(confirmed) < _LEAST_POINTS:
         raise SplashbenchError(
-            f"{scene.directory}: the views agree on the depth of {len(confirmed)} pixels of the container,"
+            f"{scene.directory}: the views agree on the depth of {len(confirmed)} pixels within the masks of {where},"
             f" {_LEAST_POINTS} are needed; {_REMEDY}"
         )
     low, high = np.quantile(confirmed, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
-    mesh = _surface(Grid.over(Bounds(low, high).padded(_MARGIN), _CELLS), views, scene)
-    projections = verify(mesh, np.eye(4), list(outlines.values()), masks)
+    grid = Grid.over(Bounds(low, high).padded(_MARGIN), _CELLS)
+    mesh = _surface(grid, views)
+    if mesh is None:
+        raise SplashbenchError(f"{scene.directory}: the depths within the masks of {where} make no surface; {_REMEDY}")
+    # As the file has it.
+    mesh = ContainerMesh(mesh.vertices.astype(np.float32), mesh.faces)
+    shown = {name: _in_window(mask, mask_cameras[name], scene.cameras[name]) for name, mask in masks.items()}
+    found = Reconstruction(mesh, grid.origin, {})
+    projections = verify(mesh, found.pose, [scene.cameras[name] for name in shown], shown)
     overlap = float(np.median([projections[name].iou for name in masks if name in scene.train]))
     if overlap < _LEAST_COVER:
         raise SplashbenchError(
-            f"{scene.directory}: the surface found covers {overlap:.2f} of the container masks (intersection over"
+            f"{scene.directory}: the surface found overlaps the masks of {where} by {overlap:.2f} (intersection over"
             f" union, median of the training views), {_LEAST_COVER} are needed; {_REMEDY}"
         )
-    return Reconstruction(mesh, projections)
+    return replace(found, projections=projections)
 
 
-def _surface(grid: Grid, views: list[_View], scene: Scene) -> ContainerMesh:
+def _in_window(mask: NDArray[np.bool_], of: Camera, camera: Camera) -> NDArray[np.bool_]:
+    """`mask` [H, W] of a camera as `camera` sees it, the same one with another window."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T @ of.K.T
+    column, row = np.floor(rays[..., 0] / rays[..., 2]), np.floor(rays[..., 1] / rays[..., 2])
+    inside = (row >= 0) & (column >= 0) & (row < of.height) & (column < of.width)
+    seen = mask[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
+    return np.asarray(inside & seen)
+
+
+def _surface(grid: Grid, views: list[_View]) -> ContainerMesh | None:
+    """The surface relative to the grid's origin, scene units; None where there is none."""
     field = np.stack([_fused(points, grid.voxel, views) for points in _slabs(grid)])
     field = ndimage.gaussian_filter(field, _SMOOTHING, mode="nearest")
     pieces, count = ndimage.label(field < 0)
-    if count:
-        sizes = np.bincount(pieces.ravel())[1:]
-        small = np.flatnonzero(sizes < _LEAST_PIECE * sizes.max()) + 1
-        field[np.isin(pieces, small)] = 1.0
-    if not (field < 0).any():
-        raise SplashbenchError(f"{scene.directory}: the views' depths make no surface; {_REMEDY}")
+    if not count:
+        return None
+    sizes = np.bincount(pieces.ravel())[1:]
+    small = np.flatnonzero(sizes < _LEAST_PIECE * sizes.max()) + 1
+    field[np.isin(pieces, small)] = 1.0
     # Closed at the grid's faces.
-    field = np.pad(field, 1, constant_values=1.0)
-    vertices, faces, _, _ = marching_cubes(field, 0.0)
-    return ContainerMesh(grid.to_scene(vertices - 1), faces[:, ::-1])
+    vertices, faces, _, _ = marching_cubes(np.pad(field, 1, constant_values=1.0), 0.0)
+    return ContainerMesh((vertices - 1) * grid.voxel, faces[:, ::-1])
 
 
 def _slabs(grid: Grid) -> Iterator[NDArray[np.float64]]:
@@ -192,15 +234,18 @@ def _slabs(grid: Grid) -> Iterator[NDArray[np.float64]]:
 def _fused(points: NDArray[np.float64], voxel: float, views: list[_View]) -> NDArray[np.float64]:
     """The truncated signed distance at points [ny, nz, 3], in [-1, 1]: positive where it is free."""
     flat = points.reshape(-1, 3)
-    total, weights, free = np.zeros(len(flat)), np.zeros(len(flat)), np.zeros(len(flat), bool)
+    total, weights = np.zeros(len(flat)), np.zeros(len(flat))
+    known, free = np.zeros(len(flat), bool), np.zeros(len(flat), bool)
     for view in views:
         within, beside = view.within(flat)
-        distance, weight = view.distances(flat)
-        weight = weight * (within & (distance > -_BEHIND * voxel))
+        distance, shown, confirmed = view.distances(flat)
+        speaks = within & (distance > -_BEHIND * voxel)
+        weight = np.where(confirmed, 1.0, _DOUBTED) * (speaks & shown)
         total += weight * np.clip(distance / (_FRONT * voxel), -1, 1)
         weights += weight
+        known |= speaks & confirmed
         free |= beside
-    known = (weights > 0) & ~free
+    known &= ~free
     return np.where(known, total / np.where(known, weights, 1), 1.0).reshape(points.shape[:2])
 
 
@@ -211,7 +256,7 @@ def picture(scene: Scene, mesh: ContainerMesh, width: int = 480) -> NDArray[np.u
     """
     shown = []
     for name, camera in scene.cameras.items():
-        small = camera.scaled(width / camera.width)
+        small = camera.scaled(min(1.0, width / camera.width))
         shown.append(overlay(mesh, np.eye(4), camera, image=scene.image(name, 0), width=small.width))
         shown.append(_lit(depth_image(mesh, small), small))
     return in_pairs(shown)

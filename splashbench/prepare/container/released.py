@@ -16,7 +16,7 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.container.check import Projection, verify
-from splashbench.prepare.container.entry import LEAST_OVERLAP, known_of, masks_of, require_place, write_entry
+from splashbench.prepare.container.entry import LEAST_OVERLAP, doubtful, known_of, masks_of, require_place, write_entry
 from splashbench.prepare.container.placement import Axis, Placement, place_by_silhouettes, up_from_container
 from splashbench.prepare.container.stage import name_in_scene
 from splashbench.scene import Scene
@@ -42,7 +42,7 @@ class ReleasedPlacement:
 
     def doubtful(self) -> list[str]:
         """Cameras in which mesh and mask overlap too little, among them such as did not decide."""
-        return [name for name, projection in self.projections.items() if projection.iou < LEAST_OVERLAP]
+        return doubtful(self.projections)
 
 
 def place_in_scene(
@@ -56,9 +56,9 @@ def place_in_scene(
     Raises SplashbenchError for fewer than two masks of training cameras, other cameras than the scene's, and a mesh
     that does not cover its masks.
     """
-    masks, outlines = masks_of(scene, masked)
+    masks, mask_cameras = masks_of(scene, masked)
     source = f"{(masked or scene).directory / 'container_mask'}"
-    training = [camera for name, camera in outlines.items() if name in scene.train]
+    training = [camera for name, camera in mask_cameras.items() if name in scene.train]
     placement = place_by_silhouettes(
         mesh,
         training,
@@ -68,7 +68,7 @@ def place_in_scene(
         gravity=None,
         source=source,
     )
-    projections = verify(mesh, placement.pose, list(outlines.values()), masks)
+    projections = verify(mesh, placement.pose, list(mask_cameras.values()), masks)
     overlap = float(np.median([projections[camera.name].iou for camera in training]))
     if overlap < LEAST_OVERLAP:
         raise SplashbenchError(
