@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from splashbench.plates.depth import DepthMap, depth_maps, guessed, interpolated, lift
+from splashbench.plates.depth import DepthMap, depth_maps, guessed, interpolated, lift, pixels_at
 from splashbench.plates.plate import Plate
 
 # Lifted points per anchor kept: voxels merge what several views see.
@@ -85,7 +85,7 @@ def _lift(
     inverse = np.zeros(len(uv))
     kept = unknown = np.ones(len(uv), dtype=bool)
     if depth is not None:
-        row, column, _ = depth.pixels(uv * depth.camera.width / camera.width)
+        row, column, _ = pixels_at(depth.camera, uv * depth.camera.width / camera.width)
         inverse = depth.inverse[row, column].astype(np.float64)
         trusted = depth.trusted[row, column]
         # What trusted pixels of other views cover needs no worse guess.

@@ -15,7 +15,7 @@ examples:
 For an opaque container without a scan (with one: `splashbench scene place`). How deep its surface lies in the training
 views is found by plane sweep on what stands still, within container_mask/ of the training cameras; the masks of the
 test cameras verify it. It needs texture, and views that overlap. splashsplat then knows what the container hides.
-Gravity and metric scale stay unknown. The scene is another one for the scorer then: run methods again.
+Gravity and metric scale stay as they are. The scene is another one for the scorer then: run methods again.
 """
 
 
@@ -47,7 +47,7 @@ def reconstruct(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene container`."""
     from splashbench.errors import SplashbenchError
     from splashbench.files import write_png
-    from splashbench.prepare.container.entry import require_picture, require_place
+    from splashbench.prepare.container.entry import doubtful, require_picture, require_place
     from splashbench.prepare.container.footage import container_from_footage, picture, write_reconstruction
     from splashbench.scene import Scene
 
@@ -57,15 +57,16 @@ def reconstruct(arguments: argparse.Namespace) -> int:
             f"{scene.directory / 'scene.json'}: the container is transparent; it hides nothing, and its depth cannot be"
             " seen; place a scan (`splashbench scene place`)"
         )
-    require_place(scene, None, arguments.replace)
+    require_place(scene, arguments.replace)
     require_picture(arguments.picture)
     masked = None if arguments.masks is None else Scene.open(arguments.masks)
     say(f"reconstructing the container from {len(scene.train)} training views")
     found = container_from_footage(scene, masked)
-    drawn = None if arguments.picture is None else picture(scene, found.placed)
+    drawn = None if arguments.picture is None else picture(scene, found)
     path = write_reconstruction(scene, found, arguments.replace)
     if drawn is not None:
         write_png(arguments.picture, drawn)
+    doubted = doubtful(found.projections)
     if arguments.json:
         emit(
             {
@@ -73,14 +74,14 @@ def reconstruct(arguments: argparse.Namespace) -> int:
                 "mesh": str(path),
                 "faces": len(found.mesh.faces),
                 "overlap": {name: projection.iou for name, projection in found.projections.items()},
-                "doubtful": found.doubtful(),
+                "doubtful": doubted,
             }
         )
     for name, projection in found.projections.items():
         held_out = "" if name in scene.train else " (held out)"
         say(f"camera {name}{held_out}: surface and mask overlap {projection.iou:.3f}")
-    if found.doubtful():
-        say(f"note: little overlap in camera {', '.join(found.doubtful())}; look at --picture before you trust it")
+    if doubted:
+        say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")
     if scene.container_transparent is None:
         say("note: it was taken to be opaque; a container that is seen through needs a scan")
     say(f"wrote {path}, {len(found.mesh.faces)} triangles, and scene.json; run methods again")

@@ -75,7 +75,7 @@ def _positive(text: str) -> float:
 def place(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene place`."""
     from splashbench.files import write_png
-    from splashbench.prepare.container.entry import picture, require_picture
+    from splashbench.prepare.container.entry import doubtful, picture, require_picture
     from splashbench.prepare.container.released import place_in_scene, require_container_place, write_placement
     from splashbench.scene import Scene
     from splashbench.scene.container import read_mesh
@@ -92,6 +92,7 @@ def place(arguments: argparse.Namespace) -> int:
     if drawn is not None:
         write_png(arguments.picture, drawn)
     placement = found.placement
+    doubted = doubtful(found.projections)
     if arguments.json:
         emit(
             {
@@ -105,7 +106,7 @@ def place(arguments: argparse.Namespace) -> int:
                 "up_is_ambiguous": placement.up_is_ambiguous,
                 "turn": placement.turn,
                 "overlap": {name: projection.iou for name, projection in found.projections.items()},
-                "doubtful": found.doubtful(),
+                "doubtful": doubted,
             }
         )
     for name, projection in found.projections.items():
@@ -113,15 +114,15 @@ def place(arguments: argparse.Namespace) -> int:
         off = "" if distance is None else f", outlines {distance:.2f} px apart"
         held_out = "" if name in scene.train else " (held out)"
         say(f"camera {name}{held_out}: mesh and mask overlap {projection.iou:.3f}{off}")
-    _say_what_is_doubtful(found, meta)
+    _say_what_is_doubtful(found, doubted, meta)
     say(f"wrote {scene.directory / 'scene.json'}: a scene unit is {meta.metres_per_unit:.4g} m; run methods again")
     return 0
 
 
-def _say_what_is_doubtful(found: ReleasedPlacement, meta: SceneMeta) -> None:
+def _say_what_is_doubtful(found: ReleasedPlacement, doubted: list[str], meta: SceneMeta) -> None:
     placement = found.placement
-    if found.doubtful():
-        say(f"note: little overlap in camera {', '.join(found.doubtful())}; look at --picture before you trust it")
+    if doubted:
+        say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")
     if placement.up_is_ambiguous:
         say(f"note: the mesh fits with other directions up as well; {placement.up_axis} was taken, see --up")
     if placement.turn != "determined":

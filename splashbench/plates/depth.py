@@ -56,11 +56,12 @@ class DepthMap:
         points = lift(self.camera, np.stack([u.ravel(), v.ravel()], axis=1), self.inverse.ravel())
         return points.reshape(*self.inverse.shape, 3)
 
-    def pixels(self, uv: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Rows, columns (within the image) and whether they are of the image, of pixel positions [N, 2]."""
-        column, row = np.floor(uv).astype(np.int64).T
-        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
-        return np.clip(row, 0, self.camera.height - 1), np.clip(column, 0, self.camera.width - 1), inside
+
+def pixels_at(camera: Camera, uv: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Rows, columns (within the image) and whether they are of the image, of pixel positions [N, 2]."""
+    column, row = np.floor(uv).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1), inside
 
 
 def lift(camera: Camera, uv: NDArray, inverse: NDArray) -> NDArray[np.float64]:
@@ -93,7 +94,7 @@ def depth_maps(points: NDArray[np.float32] | None, plates: list[Plate]) -> list[
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _COVER_RADIUS + 1, 2 * _COVER_RADIUS + 1))
     for depth in maps:
         uv, distance = depth.camera.project(trusted)
-        row, column, inside = depth.pixels(uv[distance > 0])
+        row, column, inside = pixels_at(depth.camera, uv[distance > 0])
         depth.covered[row[inside], column[inside]] = True
         depth.covered = cv2.dilate(depth.covered.astype(np.uint8), disc) > 0
     return maps
@@ -102,7 +103,7 @@ def depth_maps(points: NDArray[np.float32] | None, plates: list[Plate]) -> list[
 def _agrees(cloud: NDArray, other: DepthMap, tolerance: float) -> NDArray[np.bool_]:
     """bool [N]: whether points lie on the surface that another view's sweep sees in their direction."""
     uv, distance = other.camera.project(cloud)
-    row, column, inside = other.pixels(np.where(distance[:, None] > 0, uv, -1.0))
+    row, column, inside = pixels_at(other.camera, np.where(distance[:, None] > 0, uv, -1.0))
     expected = 1 / np.where(distance > 0, distance, np.inf)
     return np.asarray(inside & (np.abs(other.inverse[row, column] - expected) < tolerance))
 

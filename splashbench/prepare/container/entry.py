@@ -16,7 +16,7 @@ from splashbench.scene import Camera, Scene
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.layout import SceneMeta, plain_name
 
-#: Below this overlap of mesh and mask a camera is worth a look.
+#: Below this overlap of mesh and mask a camera is worth a look; below it on the median, a scan is of another container.
 LEAST_OVERLAP = 0.8
 # Extrinsics of the same camera, with and without a crop, agree to this.
 _SAME_POSE = 1e-6
@@ -62,19 +62,14 @@ def doubtful(projections: Mapping[str, Projection]) -> list[str]:
     return [name for name, projection in projections.items() if projection.iou < LEAST_OVERLAP]
 
 
-def require_place(scene: Scene, name: str | None, replace: bool) -> None:
-    """Raise SplashbenchError, before long work, unless file `name` may become the scene's container.
-
-    name: None where it is not known yet.
+def require_place(scene: Scene, replace: bool) -> None:
+    """Raise SplashbenchError, before long work, unless the scene may get a container.
 
     For a scene whose folder may not be written, and where a container is there already, unless it is to be replaced.
     """
     require_folder_place(scene.directory)
     if not replace and scene.meta is not None and scene.meta.container_mesh is not None:
         raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace replaces it")
-    path = scene.directory / (name or "")
-    if name is not None and not replace and path.exists():
-        raise SplashbenchError(f"{path} is there already; move it away, or --replace to replace it")
 
 
 def known_of(scene: Scene) -> SceneMeta:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,10 @@ from skimage.measure import marching_cubes
 from splashbench.errors import SplashbenchError
 from splashbench.observe import Bounds, Grid
 from splashbench.observe.container import depth_image
-from splashbench.plates.depth import SWEEP_SIDE, DepthMap, depth_maps
+from splashbench.plates.depth import SWEEP_SIDE, DepthMap, depth_maps, pixels_at
 from splashbench.plates.plate import make_plate
 from splashbench.prepare.container.check import Projection, overlay, verify
 from splashbench.prepare.container.entry import (
-    doubtful,
     in_pairs,
     masks_of,
     require_place,
@@ -68,43 +67,27 @@ class Reconstruction:
     """A container from the footage.
 
     Attributes:
-        mesh: relative to `origin`, so that its file keeps the precision, in scene units.
-        origin: [3], scene units.
+        mesh: in scene units, near its own origin, so that its file keeps the precision.
+        pose: mesh to scene, [4, 4].
         projections: how it and the mask agree in each camera that has one, held-out ones too.
     """
 
     mesh: ContainerMesh
-    origin: NDArray[np.float64]
+    pose: NDArray[np.float64]
     projections: dict[str, Projection]
 
-    @property
-    def pose(self) -> NDArray[np.float64]:
-        """Mesh to scene, [4, 4]."""
-        matrix = np.eye(4)
-        matrix[:3, 3] = self.origin
-        return matrix
 
-    @property
-    def placed(self) -> ContainerMesh:
-        """The mesh where it stands, scene units."""
-        return self.mesh.placed(self.pose)
-
-    def doubtful(self) -> list[str]:
-        """Cameras in which mesh and mask overlap too little."""
-        return doubtful(self.projections)
-
-
-def write_reconstruction(scene: Scene, found: Reconstruction, anew: bool = False) -> Path:
+def write_reconstruction(scene: Scene, found: Reconstruction, replace: bool = False) -> Path:
     """Write the mesh into the scene's folder and name it in scene.json; returns its path. Other fields stay.
 
-    anew: whether a container may be there already; an earlier reconstruction's file goes.
+    replace: whether a container may be there already; an earlier reconstruction's file goes.
 
     Raises SplashbenchError as `require_place` does.
     """
-    mesh = trimesh.Trimesh(found.mesh.vertices.astype(np.float32), found.mesh.faces, process=False)
+    require_place(scene, replace)
+    mesh = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces, process=False)
     content = mesh.export(file_type="ply")
     name = _FILE.format(hashlib.sha256(content).hexdigest()[:8])
-    require_place(scene, name, anew)
     write_entry(scene, name, lambda path: path.write_bytes(content), found.pose, {"container_transparent": False})
     for path in scene.directory.glob(_FILE.format("*")):
         if path.name != name:
@@ -148,10 +131,7 @@ class _View:
 def _pixels(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray]:
     """Rows and columns (within the image) at which points [N, 3] are seen, and whether they are of the image."""
     uv, depth = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    column, row = np.where(inside[:, None], uv, 0).astype(np.int64).T
-    return row, column, inside
+    return pixels_at(camera, np.where(depth[:, None] > 0, uv, -1.0))
 
 
 def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconstruction:
@@ -187,25 +167,29 @@ def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconst
     # As the file has it.
     mesh = ContainerMesh(mesh.vertices.astype(np.float32), mesh.faces)
     shown = {name: _in_window(mask, mask_cameras[name], scene.cameras[name]) for name, mask in masks.items()}
-    found = Reconstruction(mesh, grid.origin, {})
-    projections = verify(mesh, found.pose, [scene.cameras[name] for name in shown], shown)
+    pose = np.eye(4)
+    pose[:3, 3] = grid.origin
+    projections = verify(mesh, pose, [scene.cameras[name] for name in shown], shown)
     overlap = float(np.median([projections[name].iou for name in masks if name in scene.train]))
     if overlap < _LEAST_COVER:
         raise SplashbenchError(
             f"{scene.directory}: the surface found overlaps the masks of {where} by {overlap:.2f} (intersection over"
             f" union, median of the training views), {_LEAST_COVER} are needed; {_REMEDY}"
         )
-    return replace(found, projections=projections)
+    return Reconstruction(mesh, pose, projections)
 
 
 def _in_window(mask: NDArray[np.bool_], of: Camera, camera: Camera) -> NDArray[np.bool_]:
     """`mask` [H, W] of a camera as `camera` sees it, the same one with another window."""
+    at = _positions(camera) @ (of.K @ np.linalg.inv(camera.K))[:2].T
+    rows, columns, inside = pixels_at(of, at)
+    return np.asarray(inside & mask[rows, columns]).reshape(camera.height, camera.width)
+
+
+def _positions(camera: Camera) -> NDArray[np.float64]:
+    """The centres of all pixels, row by row, homogeneous [H W, 3]."""
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T @ of.K.T
-    column, row = np.floor(rays[..., 0] / rays[..., 2]), np.floor(rays[..., 1] / rays[..., 2])
-    inside = (row >= 0) & (column >= 0) & (row < of.height) & (column < of.width)
-    seen = mask[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
-    return np.asarray(inside & seen)
+    return np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
 
 
 def _surface(grid: Grid, views: list[_View]) -> ContainerMesh | None:
@@ -249,28 +233,27 @@ def _fused(points: NDArray[np.float64], voxel: float, views: list[_View]) -> NDA
     return np.where(known, total / np.where(known, weights, 1), 1.0).reshape(points.shape[:2])
 
 
-def picture(scene: Scene, mesh: ContainerMesh, width: int = 480) -> NDArray[np.uint8]:
+def picture(scene: Scene, found: Reconstruction, width: int = 480) -> NDArray[np.uint8]:
     """To judge by eye, a row per camera: the first image with the mesh's outline, the mesh lit from the camera.
 
     RGB uint8 [H, W, 3].
     """
+    placed = found.mesh.placed(found.pose)
     shown = []
     for name, camera in scene.cameras.items():
         small = camera.scaled(min(1.0, width / camera.width))
-        shown.append(overlay(mesh, np.eye(4), camera, image=scene.image(name, 0), width=small.width))
-        shown.append(_lit(depth_image(mesh, small), small))
+        shown.append(overlay(found.mesh, found.pose, camera, image=scene.image(name, 0), width=small.width))
+        shown.append(_lit(depth_image(placed, small), small))
     return in_pairs(shown)
 
 
 def _lit(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
     """A surface of this depth [H, W], lit from the camera: grey where there is one, black elsewhere."""
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
+    rays = (_positions(camera) @ np.linalg.inv(camera.K).T).reshape(*depth.shape, 3)
     points = rays * np.where(np.isfinite(depth), depth, np.nan)[..., None]
     normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
-    towards = -np.einsum("hwc,hwc->hw", normals, rays)
     length = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        light = np.nan_to_num(np.abs(towards) / length)
+        light = np.nan_to_num(np.abs((normals * rays).sum(axis=-1)) / length)
     grey = np.clip(40 + 215 * light, 0, 255) * np.isfinite(depth)
     return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1)

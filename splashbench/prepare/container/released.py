@@ -16,7 +16,7 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.container.check import Projection, verify
-from splashbench.prepare.container.entry import LEAST_OVERLAP, doubtful, known_of, masks_of, require_place, write_entry
+from splashbench.prepare.container.entry import LEAST_OVERLAP, known_of, masks_of, require_place, write_entry
 from splashbench.prepare.container.placement import Axis, Placement, place_by_silhouettes, up_from_container
 from splashbench.prepare.container.stage import name_in_scene
 from splashbench.scene import Scene
@@ -39,10 +39,6 @@ class ReleasedPlacement:
     projections: dict[str, Projection]
     gravity: tuple[float, float, float]
     metres_per_unit: float
-
-    def doubtful(self) -> list[str]:
-        """Cameras in which mesh and mask overlap too little, among them such as did not decide."""
-        return doubtful(self.projections)
 
 
 def place_in_scene(
@@ -82,13 +78,16 @@ def place_in_scene(
 def require_container_place(scene: Scene, mesh_file: Path, replace: bool) -> None:
     """Raise SplashbenchError, before long work, unless `mesh_file` may become the scene's container.
 
-    Besides `require_place`, for a file of no format that scenes have.
+    Besides `require_place`, for a file of no format that scenes have, and one whose name in the scene is taken.
     """
     if mesh_file.suffix.lower() not in FORMATS:
         raise SplashbenchError(f"{mesh_file} is none of {', '.join(FORMATS)}; convert it")
     if not mesh_file.is_file():
         raise SplashbenchError(f"{mesh_file} is no file; give the container's mesh")
-    require_place(scene, name_in_scene(mesh_file), replace)
+    require_place(scene, replace)
+    path = scene.directory / name_in_scene(mesh_file)
+    if not replace and path.exists():
+        raise SplashbenchError(f"{path} is there already; move it away, or --replace to replace it")
 
 
 def write_placement(
