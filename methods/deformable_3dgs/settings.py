@@ -26,8 +26,8 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 4000, "views_per_step": 1, "hull_points": 6000, "most": 14_000, "rate_factor": 4.0,
-            "color_factor": 4.0, "warm_up": 0.02, "depth": 4, "width": 64, "network_factor": 8.0, "head_factor": 0.03,
+            "iterations": 8000, "views_per_step": 1, "static_points": 2500, "hull_points": 2500, "most": 6000,
+            "color_factor": 4.0, "warm_up": 0.02, "depth": 4, "width": 64, "network_factor": 4.0, "head_factor": 0.03,
             "growth_factor": 0.003, "network_steps": "muon",
         },
         "paper": {
