@@ -9,7 +9,7 @@ import functools
 import os
 from pathlib import Path
 
-from setuptools import Extension, setup  # type: ignore[import-untyped]
+from setuptools import Extension, find_packages, setup  # type: ignore[import-untyped]
 from setuptools.command.bdist_wheel import bdist_wheel  # type: ignore[import-untyped]
 from setuptools.command.build_ext import build_ext  # type: ignore[import-untyped]
 from setuptools.errors import CompileError  # type: ignore[import-untyped]
@@ -30,6 +30,24 @@ def compiler() -> build_kernel.Compiler:
         return build_kernel.installed_compiler(TARGET, os.environ)
     except KernelBuildError as error:
         raise CompileError(str(error)) from None
+
+
+#: Folder at the top -> the name it installs under.
+FOLDERS = {
+    "splashbench": "splashbench",
+    "methods": "splashbench_methods",
+    "data_manifest": "splashbench_data_manifest",
+    "leaderboards": "splashbench_leaderboards",
+}
+
+
+def packages() -> list[str]:
+    """Every folder with an __init__.py below FOLDERS, by the name it installs under."""
+    return [
+        ".".join([name, *below.split(".")] if below else [name])
+        for folder, name in FOLDERS.items()
+        for below in ["", *sorted(find_packages(folder))]
+    ]
 
 
 class BuildKernel(build_ext):
@@ -67,6 +85,8 @@ class PlatformWheel(bdist_wheel):
 
 
 setup(
+    packages=packages(),
+    package_dir={name: folder for folder, name in FOLDERS.items()},
     ext_modules=[
         Extension(
             ".".join([*build_kernel.KERNEL.parts, f"libsplash_{variant.name}"]),

@@ -22,8 +22,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from splashbench_methods.splashsplat.fit import composite
-from splashbench_methods.splashsplat.method import FittedSplashSplat, SplashSplat
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
@@ -32,6 +30,8 @@ from splashbench.progress import track
 from splashbench.scene import Camera, Scene, TrainingScene
 from splashbench.score.protocol import require_complete
 from splashbench.submission import IDENTITY, Submission, seal, to_8bit, write_view
+from splashbench_methods.splashsplat.appearance.fitting import composite
+from splashbench_methods.splashsplat.method import FittedSplashSplat, SplashSplat
 
 
 @torch.no_grad()

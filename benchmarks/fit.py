@@ -23,11 +23,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from splashbench.adapter import hardware
-from splashbench.adapter.discovery import load_method
-from splashbench.adapter.runner import parse_overrides, run_method
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_json, write_text
+from splashbench.harness import hardware
+from splashbench.harness.discovery import load_method
+from splashbench.harness.runner import parse_overrides, run_method
 from splashbench.scene import Scene
 
 

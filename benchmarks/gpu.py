@@ -28,8 +28,8 @@ from typing import Any
 import render as maker  # benchmarks/render.py, beside this file
 import torch
 
-from splashbench.adapter import hardware
 from splashbench.files import write_json
+from splashbench.harness import hardware
 from splashbench.parallel import thread_count
 from splashbench.render import cuda, native, rasterize
 

@@ -47,8 +47,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from splashbench.adapter import hardware
 from splashbench.files import write_json
+from splashbench.harness import hardware
 from splashbench.render import cpu, freeze, native, rasterize, tile_modes, to_tiles
 from splashbench.scene import Camera
 

@@ -29,8 +29,8 @@ from splashbench.files import write_text
 from splashbench.progress import track
 from splashbench.scene import Scene
 from splashbench.score import PROTOCOL_V1
+from splashbench.score.image.silhouette import iou
 from splashbench.score.protocol import require_complete, require_reference
-from splashbench.score.silhouette import iou
 from splashbench.submission import Submission
 
 

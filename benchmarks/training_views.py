@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from splashbench.adapter.contract import Fitted
-from splashbench.adapter.discovery import load_method
 from splashbench.files import write_text
+from splashbench.harness.contract import Fitted
+from splashbench.harness.discovery import load_method
 from splashbench.progress import track
 from splashbench.scene import Scene
 from splashbench.submission import Submission

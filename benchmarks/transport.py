@@ -36,22 +36,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splashbench_methods.splashsplat.config import SplashSplatConfig
-from splashbench_methods.splashsplat.flip import FlipSettings, FlipSolver, gravity_in_voxels
-from splashbench_methods.splashsplat.motion import Step
-from splashbench_methods.splashsplat.observations import Observations
-from splashbench_methods.splashsplat.resample import newborns
 
-from splashbench.adapter import hardware
-from splashbench.adapter.contract import Run
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_json, write_text
+from splashbench.harness import hardware
+from splashbench.harness.contract import Run
 from splashbench.observe.container import solid_distance
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 from splashbench.progress import Bar
 from splashbench.scene import Scene
 from splashbench.scene.scene import TrainingScene
+from splashbench_methods.splashsplat.carriers.resampling import newborns
+from splashbench_methods.splashsplat.fields.observations import Observations
+from splashbench_methods.splashsplat.flip.solver import FlipSettings, FlipSolver, gravity_in_voxels
+from splashbench_methods.splashsplat.motion.step import Step
+from splashbench_methods.splashsplat.settings import SplashSplatConfig
 
 VALID_VOXELS = 0.5
 

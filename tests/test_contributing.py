@@ -5,11 +5,11 @@ import re
 from pathlib import Path
 
 import pytest
-from splashbench_methods.hull_points import HullPoints
 
-from splashbench.adapter.runner import run_method
+from splashbench.harness.runner import run_method
 from splashbench.scene import Scene
 from splashbench.submission import Status, check_submission
+from splashbench_methods.hull_points import HullPoints
 
 GUIDE = Path(__file__).parents[1] / "CONTRIBUTING.md"
 

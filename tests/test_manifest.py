@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from splashbench_data_manifest import (
+
+from splashbench.manifest import (
     Archive,
     SceneFacts,
     load_archive,
@@ -17,7 +18,7 @@ from splashbench_data_manifest import (
     load_scenes,
     load_targets,
 )
-from splashbench_leaderboards import paper_one_step_rows, paper_rows
+from splashbench.paper_figures import paper_one_step_rows, paper_rows
 
 ROOT = Path(__file__).parents[1]
 

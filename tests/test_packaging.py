@@ -104,7 +104,7 @@ def test_every_entry_point_leads_to_a_module_in_the_wheel(wheel: Path, project: 
 def test_data_is_found_from_an_installed_wheel(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path)
     code = (
-        "import splashbench_data_manifest as m, splashbench_leaderboards as l;"
+        "import splashbench.manifest as m, splashbench.paper_figures as l;"
         "print(m.__file__); print(len(m.load_scenes()), m.load_archive().name, len(m.load_comparison()) > 1);"
         "print(len(l.paper_rows()) > 1)"
     )
@@ -127,7 +127,7 @@ def run_python(code: str, cwd: Path, **environment: str) -> str:
     [
         ("splashbench.cli.main", ["torch", "numba", "cv2", "matplotlib", "pycolmap", "av", "scipy", "pandas"]),
         ("splashbench.scene", ["torch", "numba", "cv2", "matplotlib", "pycolmap", "av"]),
-        ("splashbench_data_manifest", ["torch", "numba", "cv2", "matplotlib", "pycolmap", "av"]),
+        ("splashbench.manifest", ["torch", "numba", "cv2", "matplotlib", "pycolmap", "av"]),
     ],
 )
 def test_importing_stays_light(module: str, heavy: list[str], tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.background.depth import look_at
+from splashbench.background.plane_sweep import for_opencv, plane_homography
 from splashbench.files import write_json
-from splashbench.plates.depth import look_at
-from splashbench.plates.sweep import for_opencv, plane_homography
+from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.scene import Camera, Particles, TrainingScene
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from splashbench_methods.scaffold_gs import ScaffoldGS
+from ..scaffold_gs import ScaffoldGS
 
 
 class Nothing(ScaffoldGS):

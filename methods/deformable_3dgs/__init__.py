@@ -1,5 +1,5 @@
 """Deformable-3DGS: canonical Gaussians and a network that moves them (Yang et al., CVPR 2024)."""
 
-from splashbench_methods.deformable_3dgs.method import Deformable3DGS
+from .method import Deformable3DGS
 
 __all__ = ["Deformable3DGS"]

@@ -6,18 +6,19 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from splashbench_methods.deformable_3dgs.model import ROWS, DeformableModel
-from splashbench_methods.deformable_3dgs.settings import Settings
-from splashbench_methods.gaussian_splatting.density import DensityControl
-from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
-from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
-from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
-from splashbench_methods.gaussian_splatting.photographs import Photographs
-from splashbench_methods.gaussian_splatting.start import camera_extent, started
 
-from splashbench.adapter.contract import Method, MethodConfig, Run
 from splashbench.files import read_npz
+from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.fitting import fit_dynamic
+from splashbench.gaussians.mixed import MODEL_FILE, MixedFitted, load_tables
+from splashbench.gaussians.optimizer import Rate, RowOptimizer
+from splashbench.gaussians.photographs import Photographs
+from splashbench.gaussians.start import camera_extent, started
+from splashbench.harness.contract import Method, MethodConfig, Run
 from splashbench.scene import TrainingScene
+
+from .model import ROWS, DeformableModel
+from .settings import Settings
 
 # Steps after which the published rates have come to their end; a fit of a real scene ends before, with 20 000.
 _POSITIONS_FALL_FOR, _NETWORK_FALLS_FOR = 30_000, 40_000

@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from splashbench_methods.deformable_3dgs.deformation import Deformation
-from splashbench_methods.gaussian_splatting import harmonics
-from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, rotation_matrices
-from splashbench_methods.gaussian_splatting.start import Start
 from torch import Tensor, nn
 
+from splashbench.gaussians import harmonics
+from splashbench.gaussians.splats import DynamicModel, Splats, rotation_matrices
+from splashbench.gaussians.start import Start
 from splashbench.scene import Camera
+
+from .deformation import Deformation
 
 # Half the side of the box that the network's octaves suit, in its units.
 _BOX = 1.3

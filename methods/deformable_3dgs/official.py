@@ -20,11 +20,13 @@ from typing import ClassVar
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
-from splashbench_methods.deformable_3dgs.deformation import Deformation
-from splashbench_methods.deformable_3dgs.model import ROWS, DeformableModel
-from splashbench_methods.gaussian_splatting.checkpoint import fill, read_weights
-from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, load_tables
-from splashbench_methods.gaussian_splatting.official import (
+from torch import Tensor, nn
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import read_json, read_model, read_npz, validate_model
+from splashbench.gaussians.mixed import MODEL_FILE, load_tables
+from splashbench.gaussians.official.checkpoint import fill, read_weights
+from splashbench.gaussians.official.importer import (
     NEAR,
     Arguments,
     OfficialFitted,
@@ -32,16 +34,15 @@ from splashbench_methods.gaussian_splatting.official import (
     last_point_cloud,
     require_finite,
 )
-from splashbench_methods.gaussian_splatting.point_cloud import PointCloud, read_point_cloud
-from splashbench_methods.gaussian_splatting.splats import unit_quaternion_matrices
-from torch import Tensor, nn
-
-from splashbench.adapter.importers import Importer
-from splashbench.errors import SplashbenchError
-from splashbench.files import read_json, read_model, read_npz, validate_model
+from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
+from splashbench.gaussians.splats import unit_quaternion_matrices
+from splashbench.harness.external.importers import Importer
 from splashbench.scene import Camera, TrainingScene
 from splashbench.scene.exporting.nerfies import MICROSECONDS
 from splashbench.scene.exporting.records import FACTS, Facts
+
+from .deformation import Deformation
+from .model import ROWS, DeformableModel
 
 _DEPTH, _WIDTH = 8, 256
 _SYNTHETIC_OCTAVES, _SYNTHETIC_FEATURES = 6, 30

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.observe import signed_distance_fields
 from splashbench.render import rasterize_arrays
 from splashbench.scene import Camera, Particles, TrainingScene

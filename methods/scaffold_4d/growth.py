@@ -12,16 +12,17 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.gaussian_splatting.screen import screen_gradients
-from splashbench_methods.gaussian_splatting.splats import Splats
-from splashbench_methods.scaffold_4d.model import AnchorSplats
-from splashbench_methods.scaffold_4d.settings import Settings
-from splashbench_methods.scaffold_gs.cells import Level
-from splashbench_methods.scaffold_gs.growth import AnchorGrowth, GrowthRules
-from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 from torch import Tensor
 
+from splashbench.gaussians.screen import screen_gradients
+from splashbench.gaussians.splats import Splats
 from splashbench.scene import Camera
+
+from ..scaffold_gs.cells import Level
+from ..scaffold_gs.growth import AnchorGrowth, GrowthRules
+from ..scaffold_gs.optimizer import AnchorOptimizer
+from .model import AnchorSplats
+from .settings import Settings
 
 LEVELS = (Level(16.0, 1.0, 0.5), Level(4.0, 2.0, 0.75), Level(1.0, 4.0, 0.875))
 

@@ -6,19 +6,20 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
-from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
-from splashbench_methods.gaussian_splatting.optimizer import Rate
-from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
-from splashbench_methods.gaussian_splatting.start import camera_extent, started
-from splashbench_methods.scaffold_4d.growth import SpacetimeGrowth
-from splashbench_methods.scaffold_4d.model import ROWS, SpacetimeAnchors, Variant, stored_children
-from splashbench_methods.scaffold_4d.settings import Settings
-from splashbench_methods.scaffold_gs.model import PER_ANCHOR
-from splashbench_methods.scaffold_gs.optimizer import RATES, AnchorOptimizer
 
-from splashbench.adapter.contract import Method, MethodConfig, Run
+from splashbench.gaussians.fitting import fit_dynamic
+from splashbench.gaussians.mixed import MODEL_FILE, MixedFitted, load_tables
+from splashbench.gaussians.optimizer import Rate
+from splashbench.gaussians.photographs import Photographs, unit_time
+from splashbench.gaussians.start import camera_extent, started
+from splashbench.harness.contract import Method, MethodConfig, Run
 from splashbench.scene import TrainingScene
+
+from ..scaffold_gs.model import PER_ANCHOR
+from ..scaffold_gs.optimizer import RATES, AnchorOptimizer
+from .growth import SpacetimeGrowth
+from .model import ROWS, SpacetimeAnchors, Variant, stored_children
+from .settings import Settings
 
 
 def rates(settings: Settings) -> dict[str, Rate]:

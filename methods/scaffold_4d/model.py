@@ -22,15 +22,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, rotation_matrices
-from splashbench_methods.gaussian_splatting.start import Start
-from splashbench_methods.scaffold_gs.model import FEATURES, PER_ANCHOR, Anchors, head, random_offsets
 from torch import Tensor, nn
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
+from splashbench.gaussians.splats import DynamicModel, Splats, rotation_matrices
+from splashbench.gaussians.start import Start
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
+
+from ..scaffold_gs.model import FEATURES, PER_ANCHOR, Anchors, head, random_offsets
 
 #: Tables with a row per anchor.
 ROWS = ("positions", *PER_ANCHOR)

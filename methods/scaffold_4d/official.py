@@ -21,34 +21,27 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from splashbench_methods.gaussian_splatting.checkpoint import fill, read_weights
-from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, load_tables
-from splashbench_methods.gaussian_splatting.official import (
+from torch import Tensor, nn
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import read_model
+from splashbench.gaussians.mixed import MODEL_FILE, load_tables
+from splashbench.gaussians.official.checkpoint import fill, read_weights
+from splashbench.gaussians.official.importer import (
     Arguments,
     OfficialFitted,
     OfficialModel,
     last_point_cloud,
     require_finite,
 )
-from splashbench_methods.gaussian_splatting.point_cloud import PointCloud, read_point_cloud
-from splashbench_methods.scaffold_4d.model import (
-    MAX_CHILDREN,
-    ROWS,
-    AnchorSplats,
-    SpacetimeAnchors,
-    State,
-    Variant,
-    stored_children,
-)
-from splashbench_methods.scaffold_gs.model import FEATURES
-from torch import Tensor, nn
-
-from splashbench.adapter.importers import Importer
-from splashbench.errors import SplashbenchError
-from splashbench.files import read_model
+from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
+from splashbench.harness.external.importers import Importer
 from splashbench.render.constants import BLUR_VARIANCE, JACOBIAN_MARGIN
 from splashbench.scene import Camera, TrainingScene
 from splashbench.scene.exporting.records import FACTS, Facts
+
+from ..scaffold_gs.model import FEATURES
+from .model import MAX_CHILDREN, ROWS, AnchorSplats, SpacetimeAnchors, State, Variant, stored_children
 
 _HEADS = {"opacity_mlp": "opacity_head", "cov_mlp": "shape_head", "flow_mlp": "flow_head", "color_mlp": "color_head"}
 #: Options that change what the networks read; none of them is in the published scripts.
@@ -75,6 +68,7 @@ class OfficialAnchors(OfficialModel, SpacetimeAnchors):
 
     def splats(self, state: State, camera: Camera) -> AnchorSplats:
         splats = super().splats(state, camera)
+        assert isinstance(splats, AnchorSplats)  # of SpacetimeAnchors, the second base
         children = self.offsets.shape[1]
         shown = in_the_image(self.positions[state.anchors, :3], self.log_scales[state.anchors, :3], camera, self.near)
         splats.opacities = splats.opacities * shown.repeat_interleave(children)

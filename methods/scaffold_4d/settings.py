@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from splashbench.adapter.contract import MethodConfig
+from splashbench.harness.contract import MethodConfig
 
 
 class Settings(MethodConfig):

@@ -7,18 +7,19 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
-from splashbench_methods.scaffold_gs.fitting import fit_model, supervised_anchors
-from splashbench_methods.scaffold_gs.model import AnchorModel, Variant, to_arrays
-from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
-from splashbench.adapter.contract import Run
+from splashbench.background.clean_plate import MAX_FRAMES, Plate, make_plate
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, read_npz
-from splashbench.plates.plate import MAX_FRAMES, Plate, make_plate
+from splashbench.gaussians.anchors import AnchorSeed, seed_anchors, sparse_anchors
+from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.harness.contract import Run
 from splashbench.render import rasterize_arrays
-from splashbench.render.torch_threads import one_torch_thread
 from splashbench.scene import Camera, TrainingScene
+
+from .fitting import fit_model, supervised_anchors
+from .model import AnchorModel, Variant, to_arrays
+from .settings import BackgroundSettings
 
 _FILE = "background.npz"
 # Where Gaussians cover a pixel by less, there is nothing: a tail of one tells no depth.

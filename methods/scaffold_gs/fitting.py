@@ -12,17 +12,18 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.gaussian_splatting.losses import l1
-from splashbench_methods.scaffold_gs.anchors import AnchorSeed
-from splashbench_methods.scaffold_gs.growth import Growth
-from splashbench_methods.scaffold_gs.model import PER_ANCHOR, AnchorModel, Variant
-from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
-from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
+from splashbench.background.clean_plate import Plate, shrunk
 from splashbench.errors import SplashbenchError
-from splashbench.plates.plate import Plate, shrunk
+from splashbench.gaussians.anchors import AnchorSeed
+from splashbench.gaussians.losses import l1
+from splashbench.gaussians.ssim import SsimTarget, ssim
 from splashbench.render import rasterize
-from splashbench.render.ssim import SsimTarget, ssim
+
+from .growth import Growth
+from .model import PER_ANCHOR, AnchorModel, Variant
+from .optimizer import AnchorOptimizer
+from .settings import BackgroundSettings
 
 _SSIM_WEIGHT = 0.2
 _VOLUME_WEIGHT = 0.01

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.gaussian_splatting.screen import screen_gradients
-from splashbench_methods.scaffold_gs.cells import Level, NewCells, new_cells
-from splashbench_methods.scaffold_gs.model import AnchorModel, Anchors, Gaussians, random_offsets
-from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
-from splashbench_methods.scaffold_gs.settings import BackgroundSettings
 
+from splashbench.gaussians.screen import screen_gradients
 from splashbench.scene import Camera
+
+from .cells import Level, NewCells, new_cells
+from .model import AnchorModel, Anchors, Gaussians, random_offsets
+from .optimizer import AnchorOptimizer
+from .settings import BackgroundSettings
 
 # The paper leaves the share that is kept open.
 LEVELS = (Level(16.0, 1.0, 0.5), Level(4.0, 2.0, 0.5), Level(1.0, 4.0, 0.5))

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from splashbench_methods.scaffold_gs.background import Background
-from splashbench_methods.scaffold_gs.settings import BackgroundSettings
-from splashbench_methods.scaffold_gs.shared import shared_background
 
-from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.scene import Camera, Particles, TrainingScene
+
+from .background import Background
+from .settings import BackgroundSettings
+from .shared import shared_background
 
 
 class StaticScene(Fitted):

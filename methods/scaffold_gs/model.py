@@ -21,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.gaussian_splatting.splats import rotation_matrices
-from splashbench_methods.scaffold_gs.anchors import AnchorSeed
 from torch import nn
+
+from splashbench.gaussians.anchors import AnchorSeed
+from splashbench.gaussians.splats import rotation_matrices
 
 FEATURES = 32
 HIDDEN = 32

@@ -8,8 +8,10 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
-from splashbench_methods.scaffold_gs.model import PER_ANCHOR, Anchors
+
+from splashbench.gaussians.optimizer import Rate, RowOptimizer
+
+from .model import PER_ANCHOR, Anchors
 
 # "published" are those of Scaffold-GS.
 RATES: dict[str, dict[str, Rate]] = {

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from splashbench.adapter.contract import MethodConfig
+from splashbench.harness.contract import MethodConfig
 
 
 class BackgroundSettings(MethodConfig):

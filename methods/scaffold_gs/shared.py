@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from splashbench_methods.scaffold_gs.background import Background, fit_background
-from splashbench_methods.scaffold_gs.settings import BackgroundSettings
-
-from splashbench.adapter.contract import Run
+from splashbench.harness.contract import Run
 from splashbench.scene import TrainingScene
+
+from .background import Background, fit_background
+from .settings import BackgroundSettings
 
 #: Of the fit; raised when a change alters what it gives, so that none is taken over from before.
 VERSION = 1

@@ -1,5 +1,5 @@
 """SpacetimeGaussians, full and lite: Gaussians that fade in and out and move on polynomials (Li et al., CVPR 2024)."""
 
-from splashbench_methods.spacetime_gaussians.method import SpacetimeGaussians, SpacetimeGaussiansLite
+from .method import SpacetimeGaussians, SpacetimeGaussiansLite
 
 __all__ = ["SpacetimeGaussians", "SpacetimeGaussiansLite"]

@@ -14,14 +14,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from splashbench_methods.gaussian_splatting.density import DensityControl
-from splashbench_methods.gaussian_splatting.photographs import Photograph, Photographs
-from splashbench_methods.gaussian_splatting.splats import Splats
-from splashbench_methods.spacetime_gaussians.model import SpacetimeModel, rays
-from splashbench_methods.spacetime_gaussians.settings import Settings
 from torch import Tensor
 
+from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.photographs import Photograph, Photographs
+from splashbench.gaussians.splats import Splats
 from splashbench.scene import Camera
+
+from .model import SpacetimeModel, rays
+from .settings import Settings
 
 PATCH = 8
 PER_RAY = 4

@@ -7,19 +7,20 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from splashbench_methods.gaussian_splatting.density import DensityControl
-from splashbench_methods.gaussian_splatting.fitting import fit_dynamic
-from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, MixedFitted, load_tables
-from splashbench_methods.gaussian_splatting.optimizer import Rate, RowOptimizer
-from splashbench_methods.gaussian_splatting.photographs import Photographs, unit_time
-from splashbench_methods.gaussian_splatting.start import camera_extent, started
-from splashbench_methods.spacetime_gaussians.guided import GuidedDensity
-from splashbench_methods.spacetime_gaussians.model import SpacetimeModel
-from splashbench_methods.spacetime_gaussians.settings import Settings
 from torch import Tensor
 
-from splashbench.adapter.contract import Method, MethodConfig, Run
+from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.fitting import fit_dynamic
+from splashbench.gaussians.mixed import MODEL_FILE, MixedFitted, load_tables
+from splashbench.gaussians.optimizer import Rate, RowOptimizer
+from splashbench.gaussians.photographs import Photographs, unit_time
+from splashbench.gaussians.start import camera_extent, started
+from splashbench.harness.contract import Method, MethodConfig, Run
 from splashbench.scene import TrainingScene
+
+from .guided import GuidedDensity
+from .model import SpacetimeModel
+from .settings import Settings
 
 
 def rates(settings: Settings, extent: float, full: bool) -> dict[str, Rate]:

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from splashbench_methods.gaussian_splatting.splats import DynamicModel, Splats, rotation_matrices
-from splashbench_methods.gaussian_splatting.start import Start
 from torch import Tensor, nn
 
+from splashbench.gaussians.splats import DynamicModel, Splats, rotation_matrices
+from splashbench.gaussians.start import Start
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
 

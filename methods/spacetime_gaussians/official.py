@@ -18,23 +18,24 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from splashbench_methods.gaussian_splatting.checkpoint import fill, read_weights
-from splashbench_methods.gaussian_splatting.mixed import MODEL_FILE, load_tables
-from splashbench_methods.gaussian_splatting.official import (
+from torch import Tensor, nn
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import read_npz
+from splashbench.gaussians.mixed import MODEL_FILE, load_tables
+from splashbench.gaussians.official.checkpoint import fill, read_weights
+from splashbench.gaussians.official.importer import (
     Arguments,
     OfficialFitted,
     OfficialModel,
     last_point_cloud,
     require_finite,
 )
-from splashbench_methods.gaussian_splatting.point_cloud import PointCloud, read_point_cloud
-from splashbench_methods.spacetime_gaussians.model import SpacetimeModel
-from torch import Tensor, nn
-
-from splashbench.adapter.importers import Importer
-from splashbench.errors import SplashbenchError
-from splashbench.files import read_npz
+from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
+from splashbench.harness.external.importers import Importer
 from splashbench.scene import Camera, TrainingScene
+
+from .model import SpacetimeModel
 
 _SIGMOID = {"sandwich": True, "sandwichnoact": False}
 _FIRST = re.compile(r"colmap_(\d{1,9})")

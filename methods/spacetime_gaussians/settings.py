@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
-from splashbench_methods.gaussian_splatting.settings import SplattingSettings
+
+from splashbench.gaussians.settings import SplattingSettings
 
 
 class Settings(SplattingSettings):

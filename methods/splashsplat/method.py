@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
-from splashbench_methods.splashsplat.config import VERSION, SplashSplatConfig
-from splashbench_methods.splashsplat.decoder import Children
-from splashbench_methods.splashsplat.fit import composite
-from splashbench_methods.splashsplat.model import Liquid
-from splashbench_methods.splashsplat.occlusion import Occlusion
-from splashbench_methods.splashsplat.reconstruct import fit_liquid
 
-from splashbench.adapter.contract import Fitted, Method, Render, Run, Support
-from splashbench.render.torch_threads import one_torch_thread
+from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.harness.contract import Fitted, Method, Render, Run, Support
 from splashbench.scene.camera import Camera
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
 
+from .appearance.decoder import Children
+from .appearance.fitting import composite
+from .appearance.occlusion import Occlusion
+from .model import Liquid
+from .reconstruction import fit_liquid
+from .settings import VERSION, SplashSplatConfig
+
 if TYPE_CHECKING:
-    from splashbench_methods.scaffold_gs import Background
+    from ..scaffold_gs import Background
 
 MIN_VIEWS = 2
 # Share of the time that the background takes, for the progress bar only.
@@ -106,7 +107,7 @@ class SplashSplat(Method):
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
         """Background, observation fields, carriers, appearance, in that order."""
-        from splashbench_methods.scaffold_gs import shared_background
+        from ..scaffold_gs import shared_background
 
         with run.stage("background"), one_torch_thread():
             background = shared_background(scene, config.background, run, span=(0, _BACKGROUND))
@@ -118,7 +119,7 @@ class SplashSplat(Method):
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""
-        from splashbench_methods.scaffold_gs import Background
+        from ..scaffold_gs import Background
 
         static = directory / "static"
         return FittedSplashSplat(Liquid.load(directory), Background.load(static), Occlusion.load(static))

@@ -10,17 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from splashbench_methods.splashsplat.carriers import Carriers
-from splashbench_methods.splashsplat.decoder import Decoder, DecoderSettings
-from splashbench_methods.splashsplat.fit import Appearance
-from splashbench_methods.splashsplat.motion import Motion, falls_of
-from splashbench_methods.splashsplat.subframe import Track
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_npz, write_json
 from splashbench.observe.grid import Grid
 from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles
+
+from .appearance.decoder import Decoder, DecoderSettings
+from .appearance.fitting import Appearance
+from .carriers.tracking import Carriers
+from .motion.step import Motion, falls_of
+from .subframe import Track
 
 FORMAT = 3
 

@@ -12,14 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from splashbench_methods.splashsplat.carriers import Carriers
-from splashbench_methods.splashsplat.decoder import CarrierState
-from splashbench_methods.splashsplat.motion import Motion
 from torch import Tensor
 
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 from splashbench.scene.geometry import STEPS_PER_VOXEL
+
+from .appearance.decoder import CarrierState
+from .carriers.tracking import Carriers
+from .motion.step import Motion
 
 # Times nearer to a frame than this fraction of the step are that frame: JSON and the harness round seconds.
 _SAME_FRAME = 1e-4

@@ -28,7 +28,7 @@ was stopped had come to. Stages, in order: sync, motion, intrinsics, poses, metr
 
 # As in session.toml (splashbench.prepare.session), repeated here so that `--help` need not import it.
 _MOST_TIMESTEPS = 10_000
-# As in splashbench.prepare.stages, likewise.
+# As in splashbench.prepare.stage_cache, likewise.
 _STAGES = ("sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene")
 
 
@@ -111,7 +111,7 @@ def _metres(text: str) -> float:
 
 def _describe(arguments: argparse.Namespace) -> int:
     """Handle `splashbench prepare SESSION --init`."""
-    from splashbench.prepare.describe.description import describe
+    from splashbench.prepare.init.description import describe
 
     found = describe(arguments.session, arguments.square_metres, arguments.replace)
     rows = [

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splashbench.cli import external
+from splashbench.cli import run_external as external
 from splashbench.cli.output import add_json, emit, say
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_method(arguments: argparse.Namespace) -> Submission:
-    from splashbench.adapter.runner import TIMING_FRAMES, parse_overrides, run_method
+    from splashbench.harness.runner import TIMING_FRAMES, parse_overrides, run_method
 
     return run_method(
         arguments.method,

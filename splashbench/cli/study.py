@@ -77,11 +77,11 @@ def _positive(text: str) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench study ablate`."""
-    from splashbench.adapter.runner import parse_overrides
+    from splashbench.harness.runner import parse_overrides
+    from splashbench.study.execution import Options, carry_out_plan
     from splashbench.study.job import Store
     from splashbench.study.plan import make_plan
     from splashbench.study.report import as_json, write_report
-    from splashbench.study.running import Options, carry_out_plan
     from splashbench.study.spec import load_spec
     from splashbench.study.table import make_table
 

@@ -164,8 +164,8 @@ def _not_negative(text: str) -> int:
 
 def run_session(arguments: argparse.Namespace) -> int:
     """Handle `splashbench synth session`."""
-    from splashbench.synth.plan import Options
-    from splashbench.synth.session import make_session
+    from splashbench.synth.recording.plan import Options
+    from splashbench.synth.recording.session import make_session
 
     options = Options(
         size=arguments.size,
@@ -218,7 +218,7 @@ def run_scene(arguments: argparse.Namespace) -> int:
 def run_verify(arguments: argparse.Namespace) -> int:
     """Handle `splashbench synth verify`."""
     from splashbench.files import write_model
-    from splashbench.synth.verify import verify_scene
+    from splashbench.synth.recording.verification import verify_scene
 
     if arguments.out and arguments.out.exists() and not arguments.replace:
         raise SplashbenchError(f"{arguments.out} exists already; give another place, or --replace to replace it")

@@ -13,7 +13,7 @@ import numpy as np
 
 from splashbench.observe.grid import Grid
 from splashbench.observe.hull import carve_views, sequence_bounds
-from splashbench.observe.shadow import CarvingContainer, ContainerShadow, focal_length
+from splashbench.observe.occlusion import CarvingContainer, ContainerShadow, focal_length
 from splashbench.observe.silhouettes import Silhouettes
 from splashbench.scene.camera import Camera
 

@@ -14,7 +14,7 @@ import numpy as np
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.kernels import carve_view
-from splashbench.observe.shadow import LIMIT_VOXELS, CarvingContainer, ContainerShadow, focal_length
+from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingContainer, ContainerShadow, focal_length
 from splashbench.observe.silhouettes import MaskedScene, Silhouettes, Window
 from splashbench.parallel import each
 

@@ -16,7 +16,7 @@ from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_frame, sequence_bounds
 from splashbench.observe.kernels import sample
-from splashbench.observe.shadow import LIMIT_VOXELS, CarvingContainer, ContainerShadow
+from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingContainer, ContainerShadow
 from splashbench.observe.silhouettes import MaskedScene, Silhouettes
 
 DistanceMethod = Literal["silhouette", "carve"]

@@ -13,13 +13,13 @@ from typing import Any, Literal
 import numpy as np
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.intrinsics import Calibration
-from splashbench.prepare.container.stage import PlacedContainer
-from splashbench.prepare.film.sampling import Sampling
+from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.masks.provider import MaskHealth
-from splashbench.prepare.posing.poses import Poses
-from splashbench.prepare.posing.scale import SceneFrame
-from splashbench.prepare.sound.sync import ClockFit, SequenceSync
+from splashbench.prepare.poses.scale import SceneFrame
+from splashbench.prepare.poses.structure_from_motion import Poses
+from splashbench.prepare.video.sampling import Sampling
 
 # Half a frame at 60 fps: the paper's mark for a well synchronised sequence (Sec. S1.1).
 HALF_FRAME_S = 0.5 / 60

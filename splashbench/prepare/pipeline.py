@@ -19,31 +19,32 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.container.verification import overlay
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, is_staged_for, sha256_file, write_json, write_text
+from splashbench.prepare import container as container_stage
 from splashbench.prepare import gates as g
+from splashbench.prepare.audio import clocks as listening
+from splashbench.prepare.audio import sync
+from splashbench.prepare.audio.clocks import Listening, SoundPaths
+from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.board import Detector
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.undistort import Undistorter
-from splashbench.prepare.container import stage as container_stage
-from splashbench.prepare.container.check import overlay
-from splashbench.prepare.container.stage import PlacedContainer
+from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.crop import Box
-from splashbench.prepare.film import motion, sampling
-from splashbench.prepare.film.video import Recording, probe
-from splashbench.prepare.masks import making as masking
+from splashbench.prepare.masks import production as masking
 from splashbench.prepare.masks.provider import Mask
 from splashbench.prepare.masks.sheet import SheetCell, sheet_times, small_cell
-from splashbench.prepare.posing import metric, rig
-from splashbench.prepare.posing.scale import SceneFrame
+from splashbench.prepare.poses import metric, rig
+from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.preparation import MaskRecord, Preparation
 from splashbench.prepare.report import html_report
 from splashbench.prepare.session import DESCRIPTION, Session
-from splashbench.prepare.sound import listening, sync
-from splashbench.prepare.sound.listening import Listening, SoundPaths
-from splashbench.prepare.sound.sync import ClockFit, SequenceSync
-from splashbench.prepare.stages import Stage, StageStore, facts_of, open_stages
+from splashbench.prepare.stage_cache import Stage, StageStore, facts_of, open_stages
+from splashbench.prepare.video import motion, sampling
+from splashbench.prepare.video.recording import Recording, probe
 from splashbench.progress import track
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, read_mesh

@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.prepare.audio.clocks import Listening, SoundPaths
+from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.intrinsics import Calibration
-from splashbench.prepare.container.stage import PlacedContainer
+from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.crop import Box
-from splashbench.prepare.film.motion import MotionInterval
-from splashbench.prepare.film.sampling import Sampling
-from splashbench.prepare.film.video import VideoInfo
 from splashbench.prepare.gates import Gate
 from splashbench.prepare.masks.provider import MaskHealth
 from splashbench.prepare.masks.sheet import Faults, SheetCell
-from splashbench.prepare.posing.poses import Poses
-from splashbench.prepare.posing.scale import SceneFrame
+from splashbench.prepare.poses.scale import SceneFrame
+from splashbench.prepare.poses.structure_from_motion import Poses
 from splashbench.prepare.session import Session
-from splashbench.prepare.sound.listening import Listening, SoundPaths
-from splashbench.prepare.sound.sync import ClockFit, SequenceSync
-from splashbench.prepare.stages import Stage, StageRecord
+from splashbench.prepare.stage_cache import Stage, StageRecord
+from splashbench.prepare.video.motion import MotionInterval
+from splashbench.prepare.video.recording import VideoInfo
+from splashbench.prepare.video.sampling import Sampling
 from splashbench.version import __version__
 
 SCHEMA_VERSION = 1

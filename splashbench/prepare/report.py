@@ -20,7 +20,7 @@ from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
 from splashbench.prepare.masks.sheet import fault_note, mask_sheet, sheet_times
 
 if TYPE_CHECKING:
-    from splashbench.prepare.container.stage import PlacedContainer
+    from splashbench.prepare.container import PlacedContainer
     from splashbench.prepare.preparation import Preparation
 
 TRAIN_COLOUR, TEST_COLOUR, SWEEP_COLOUR = "#1f5fa8", "#c2571a", "#9a9a9a"

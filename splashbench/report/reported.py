@@ -15,7 +15,7 @@ def reported_table(scene: str) -> tuple[str, list[list[str]]] | None:
 
     Scenes are known by name, in upper or lower case: downloads differ in that.
     """
-    from splashbench_leaderboards import paper_rows
+    from splashbench.paper_figures import paper_rows
 
     rows = [row for row in paper_rows() if row["scene_set"] == scene.lower()]
     if not rows:

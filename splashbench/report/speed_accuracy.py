@@ -172,7 +172,7 @@ def _labels(results: list[Result]) -> dict[tuple[str, str, str], str]:
 
 def reported_machine() -> Machine:
     """The paper's main table (means over its 20 scenes), as reported on its own machine."""
-    from splashbench_leaderboards import paper_rows
+    from splashbench.paper_figures import paper_rows
 
     machine = Machine("", reported=True)
     for row in paper_rows():

@@ -81,7 +81,7 @@ class Scene:
         return image_size(self.image_path(camera, 0))
 
     def _set_times(self) -> None:
-        from splashbench_data_manifest import load_scenes
+        from splashbench.manifest import load_scenes
 
         facts = load_scenes().get(self.name)
         # A scene.json that only adds what the release lacks (gravity, say) changes no units; a made one has a maker.

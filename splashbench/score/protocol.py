@@ -17,14 +17,14 @@ from typing import Any
 from splashbench import progress
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
-from splashbench.score.ground_truth import score_ground_truth
-from splashbench.score.lpips import load_lpips
+from splashbench.score.image.lpips import load_lpips
+from splashbench.score.image.views import Track, score_views
 from splashbench.score.metrics import METRICS
-from splashbench.score.physics import liquid_particles, score_particles
+from splashbench.score.particles.physics import liquid_particles, score_particles
+from splashbench.score.particles.uniformity import DistanceFields
 from splashbench.score.result import Digests, MetricValue, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1, Protocol
-from splashbench.score.uniformity import DistanceFields
-from splashbench.score.views import Track, score_views
+from splashbench.score.truth.comparison import score_ground_truth
 from splashbench.version import __version__
 
 REFERENCE_METHOD = "nothing"
@@ -46,7 +46,7 @@ def score_submission(
 
     Args:
         reference: the submission of the control `nothing` on this scene; without it what needs it is null.
-        lpips_weights: an .npz of LPIPS weights, see `splashbench.score.lpips.load_lpips`.
+        lpips_weights: an .npz of LPIPS weights, see `splashbench.score.image.lpips.load_lpips`.
         track: wraps an iterable with a description, to show progress.
         protocol: other settings than v1's make a result that no table mixes with v1.
         fields: signed distance from the training masks when several submissions share it, see `shared_fields`.

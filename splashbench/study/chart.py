@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from splashbench.files import atomic_path
 from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
-from splashbench.study.shown import label, scaled
+from splashbench.study.formatting import label, scaled
 from splashbench.study.spec import metric_of
 from splashbench.study.table import Row, Table
 

@@ -13,10 +13,10 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from splashbench.adapter.messages import DISK_FULL_EXIT
-from splashbench.adapter.runner import run_method
 from splashbench.errors import DiskFullError, SplashbenchError, one_line
 from splashbench.files import read_model, write_model
+from splashbench.harness.messages import DISK_FULL_EXIT
+from splashbench.harness.runner import run_method
 from splashbench.processes import end_with_parent, terminable
 from splashbench.scene import Scene
 from splashbench.score import Result, score_submission, shared_fields

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 
 from splashbench.report.results import hardware_label
 from splashbench.score.metrics import FILTER_NOTE, filter_mark
-from splashbench.study.shown import NONE, label, number, with_spread
+from splashbench.study.formatting import NONE, label, number, with_spread
 from splashbench.study.spec import DERIVED, metric_of
 from splashbench.study.table import NOT_RUN, Row, Table
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from splashbench.adapter.contract import Method
-from splashbench.adapter.discovery import load_method
-from splashbench.adapter.runner import TIMING_FRAMES, without_nulls
 from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Method
+from splashbench.harness.discovery import load_method
+from splashbench.harness.runner import TIMING_FRAMES, without_nulls
 from splashbench.scene import Scene
 from splashbench.score import PROTOCOL_V1
 from splashbench.study.scenes import changes

@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from splashbench.adapter.reuse import alone
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
+from splashbench.harness.reuse import alone
 from splashbench.scene import Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
 from splashbench.scene.layout import plain_name
 from splashbench.scene.source import ReleasedSource
-from splashbench.study.perturb import Perturbation, direction_of_loss, without_part
+from splashbench.study.perturbation import Perturbation, direction_of_loss, without_part
 from splashbench.study.spec import Variant
-from splashbench.study.views import nested_views
+from splashbench.study.view_subsets import nested_views
 
 #: Raised when a change alters the copies that the same description gives.
 _VERSION = 1

@@ -17,7 +17,7 @@ from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import validate_model
 from splashbench.score.metrics import METRICS, Metric
-from splashbench.study.perturb import Perturbation
+from splashbench.study.perturbation import Perturbation
 from splashbench.submission.withheld import Withheld
 
 #: Metrics that follow from others, tabulated here alone: sigma_D over mu_D is what the paper's Table S7 gives.

@@ -209,7 +209,7 @@ def _paper_figures(plan: Plan) -> dict[str, dict[str, float]]:
     spec = plan.spec
     if spec.paper is None:
         return {}
-    from splashbench_leaderboards import paper_rows
+    from splashbench.paper_figures import paper_rows
 
     reported: dict[str, dict[str, Any]] = {
         str(row["method"]): row for row in paper_rows() if row["scene_set"] == spec.paper.scene_set

@@ -1,6 +1,6 @@
-"""Made-up scenes: a simulated liquid seen by seven perfect pinhole cameras on one clock, with exact ground truth.
+"""Synthetic scenes: a simulated liquid seen by seven perfect pinhole cameras on one clock, with exact ground truth.
 
-Where a session (`splashbench.synth.session`) also tests the preparation, a scene isolates the methods: nothing about
+A session (`splashbench.synth.recording.session`) also tests the preparation; a scene isolates the methods. Nothing about
 calibration, synchronisation or masks is wrong. Scene units are metres, y points up.
 """
 
@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
-from splashbench.synth import simulation
-from splashbench.synth.geometry import Mesh, bowl_mesh, tank_mesh
-from splashbench.synth.lens import LensCamera
-from splashbench.synth.plan import CAMERAS, GRAVITY, TEST, TRAIN, Options, make_plan
-from splashbench.synth.rendering import Stage, View
-from splashbench.synth.room import Room, pour_room, tank_room
-from splashbench.synth.session import write_ply
-from splashbench.synth.simulation import Pour
-from splashbench.synth.surface import liquid_surface
-from splashbench.synth.trajectory import Trajectory
-from splashbench.synth.video import SensorNoise
+from splashbench.synth.imaging.geometry import Mesh, bowl_mesh, tank_mesh
+from splashbench.synth.imaging.rendering import Stage, View
+from splashbench.synth.imaging.room import Room, pour_room, tank_room
+from splashbench.synth.liquid import simulation
+from splashbench.synth.liquid.simulation import Pour
+from splashbench.synth.liquid.surface import liquid_surface
+from splashbench.synth.liquid.trajectory import Trajectory
+from splashbench.synth.recording.lens import LensCamera
+from splashbench.synth.recording.plan import CAMERAS, GRAVITY, TEST, TRAIN, Options, make_plan
+from splashbench.synth.recording.session import write_ply
+from splashbench.synth.recording.video import SensorNoise
 
 _POINTS_PER_VIEW = 4000
 _SOURCE_FRAME_MS = 1000 / 60

@@ -20,13 +20,13 @@ import pytest
 from PIL import Image
 
 from splashbench import toml
-from splashbench.adapter.runner import run_method
 from splashbench.cli.main import main
 from splashbench.files import files_together
+from splashbench.harness.runner import run_method
 from splashbench.submission import Submission, seal
-from splashbench.synth.video import write_recording
+from splashbench.synth.recording.video import write_recording
 
-METHODS = Path(__file__).parents[1] / "adapter" / "example_methods.py"
+METHODS = Path(__file__).parents[1] / "harness" / "example_methods.py"
 GOOD = f"import sys\nsys.path.insert(0, {str(METHODS.parent)!r})\nfrom example_methods import Good\n"
 # As large as a disk that is nearly full: every file beyond it fails with EFBIG (Python ignores SIGXFSZ).
 DISK_OF = (

@@ -13,7 +13,7 @@ import pytest
 
 from splashbench.cli.main import main
 
-METHODS = Path(__file__).parents[1] / "conformance" / "methods_for_conformance.py"
+METHODS = Path(__file__).parents[1] / "harness" / "conformance" / "methods_for_conformance.py"
 
 
 def test_each_check_is_a_line_and_a_fault_comes_with_its_remedy(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splashbench_methods.gaussian_splatting import fitting
-from splashbench_methods.gaussian_splatting.density import DensityControl
-from splashbench_methods.gaussian_splatting.optimizer import RowOptimizer
-from splashbench_methods.scaffold_gs import fitting as background_fitting
 
 from splashbench import toml
-from splashbench.adapter.contract import Fitted, Run
-from splashbench.adapter.discovery import load_method
 from splashbench.errors import SplashbenchError
+from splashbench.gaussians import fitting
+from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.optimizer import RowOptimizer
+from splashbench.harness.contract import Fitted, Run
+from splashbench.harness.discovery import load_method
 from splashbench.scene import Scene, TrainingScene
+from splashbench_methods.scaffold_gs import fitting as background_fitting
 
 SMALL = toml.load(Path(__file__).with_name("small_fits.toml"))
 BASELINES = ("deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d")

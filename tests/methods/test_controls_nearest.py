@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splashbench_methods.controls.nearest_camera import NearestCamera, NearestView, homography
 
-from splashbench.adapter.contract import MethodConfig, Run
+from splashbench.harness.contract import MethodConfig, Run
 from splashbench.scene import Camera, Scene
+from splashbench_methods.controls.nearest_camera import NearestCamera, NearestView, homography
 
 
 @pytest.fixture

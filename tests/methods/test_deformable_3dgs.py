@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
+from splashbench.gaussians.mixed import MixedFitted
+from splashbench.gaussians.start import Start
+from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.harness.contract import Run
+from splashbench.scene import Scene
 from splashbench_methods.deformable_3dgs import Deformable3DGS
 from splashbench_methods.deformable_3dgs.deformation import Deformation, encode
 from splashbench_methods.deformable_3dgs.method import rates
 from splashbench_methods.deformable_3dgs.model import DeformableModel
 from splashbench_methods.deformable_3dgs.settings import Settings
-from splashbench_methods.gaussian_splatting.mixed import MixedFitted
-from splashbench_methods.gaussian_splatting.start import Start
-
-from splashbench.adapter.contract import Run
-from splashbench.render.torch_threads import one_torch_thread
-from splashbench.scene import Scene
 
 SMALL = {"iterations": 200, "static_points": 300, "hull_points": 200, "most": 700, "width": 16, "depth": 4}
 

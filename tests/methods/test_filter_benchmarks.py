@@ -11,12 +11,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from splashbench_methods.splashsplat.method import SplashSplat
 
 from splashbench import toml
 from splashbench.cli.main import main
 from splashbench.scene import Scene
 from splashbench.submission import Submission, seal
+from splashbench_methods.splashsplat.method import SplashSplat
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = toml.load(Path(__file__).parent / "small_fits.toml")["splashsplat"]

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from splashbench import toml
-from splashbench.adapter.discovery import registered
-from splashbench.conformance import Report, conform
+from splashbench.harness.conformance import Report, conform
+from splashbench.harness.discovery import registered
 
 SETTINGS = toml.load(Path(__file__).with_name("small_fits.toml"))
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from splashbench import toml
-from splashbench.adapter.runner import run_method
+from splashbench.harness.runner import run_method
 from splashbench.scene import Scene
 from splashbench.submission import Status, Submission
 
 SETTINGS = toml.load(Path(__file__).with_name("small_fits.toml"))
-PEEKING = Path(__file__).parents[1] / "conformance" / "methods_for_conformance.py"
+PEEKING = Path(__file__).parents[1] / "harness" / "conformance" / "methods_for_conformance.py"
 # The lite variant is read as the full one is, scaffold_gs as `nothing` is.
 _SLOW = ("spacetime_gaussians_lite", "scaffold_gs")
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from splashbench_methods.gaussian_splatting.mixed import MixedFitted
-from splashbench_methods.gaussian_splatting.start import Start
+
+from splashbench.gaussians.mixed import MixedFitted
+from splashbench.gaussians.start import Start
+from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.harness.contract import Run
+from splashbench.render.constants import MIN_ALPHA
+from splashbench.scene import Camera, Scene
 from splashbench_methods.scaffold_4d import Scaffold4D
 from splashbench_methods.scaffold_4d.growth import SpacetimeGrowth
 from splashbench_methods.scaffold_4d.model import SpacetimeAnchors, Variant
 from splashbench_methods.scaffold_4d.settings import Settings
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
-
-from splashbench.adapter.contract import Run
-from splashbench.render.constants import MIN_ALPHA
-from splashbench.render.torch_threads import one_torch_thread
-from splashbench.scene import Camera, Scene
 
 SMALL = {"iterations": 60, "views_per_step": 2, "static_points": 300, "hull_points": 400, "most": 900}
 TIMES = np.linspace(0, 1, 11)

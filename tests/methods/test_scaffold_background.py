@@ -7,14 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splashbench_methods.controls.nothing import Nothing
-from splashbench_methods.scaffold_gs import Background, BackgroundSettings, ScaffoldGS, StaticScene, fit_background
 
 from splashbench import parallel
-from splashbench.adapter.contract import Run
 from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Run
 from splashbench.render import cpu
 from splashbench.scene import Scene
+from splashbench_methods.controls.nothing import Nothing
+from splashbench_methods.scaffold_gs import Background, BackgroundSettings, ScaffoldGS, StaticScene, fit_background
 
 SETTINGS = BackgroundSettings(iterations=150, anchors=1500, children=3, longest_side=96)
 

@@ -7,18 +7,18 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from splashbench_methods.gaussian_splatting.screen import screen_gradients
+
+from splashbench.background.clean_plate import Plate
+from splashbench.gaussians.anchors import AnchorSeed, sparse_anchors
+from splashbench.gaussians.screen import screen_gradients
+from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.render import rasterize
+from splashbench.scene import Camera
 from splashbench_methods.scaffold_gs import BackgroundSettings
-from splashbench_methods.scaffold_gs.anchors import AnchorSeed, sparse_anchors
 from splashbench_methods.scaffold_gs.fitting import fit_model
 from splashbench_methods.scaffold_gs.growth import Growth
 from splashbench_methods.scaffold_gs.model import AnchorModel, Gaussians, Variant
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
-
-from splashbench.plates.plate import Plate
-from splashbench.render import rasterize
-from splashbench.render.torch_threads import one_torch_thread
-from splashbench.scene import Camera
 
 
 @pytest.fixture(autouse=True)

@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from splashbench_methods.gaussian_splatting.losses import l1
-from splashbench_methods.gaussian_splatting.splats import rotation_matrices
-from splashbench_methods.scaffold_gs.anchors import AnchorSeed, seed_anchors, sparse_anchors
+
+from splashbench.background.clean_plate import Plate, make_plate, masked_median
+from splashbench.background.depth import depth_maps, look_at
+from splashbench.gaussians.anchors import AnchorSeed, seed_anchors, sparse_anchors
+from splashbench.gaussians.losses import l1
+from splashbench.gaussians.splats import rotation_matrices
+from splashbench.scene import Camera
 from splashbench_methods.scaffold_gs.fitting import pyramid
 from splashbench_methods.scaffold_gs.model import AnchorModel, Variant
-
-from splashbench.plates.depth import depth_maps, look_at
-from splashbench.plates.plate import Plate, make_plate, masked_median
-from splashbench.scene import Camera
 
 
 def arc_camera(name: str, degrees: float, width: int = 80, height: int = 60) -> Camera:

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from splashbench_methods.gaussian_splatting.mixed import MixedFitted
-from splashbench_methods.gaussian_splatting.photographs import Photographs
+
+from splashbench.gaussians.mixed import MixedFitted
+from splashbench.gaussians.photographs import Photographs
+from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.harness.contract import Run
+from splashbench.scene import Camera, Scene
 from splashbench_methods.spacetime_gaussians import SpacetimeGaussians, SpacetimeGaussiansLite
 from splashbench_methods.spacetime_gaussians.guided import PATCH, PER_RAY, along_worst_rays
 from splashbench_methods.spacetime_gaussians.model import SpacetimeModel, rays
 from splashbench_methods.spacetime_gaussians.settings import Settings
-
-from splashbench.adapter.contract import Run
-from splashbench.render.torch_threads import one_torch_thread
-from splashbench.scene import Camera, Scene
 
 SMALL = {"iterations": 60, "views_per_step": 5, "static_points": 300, "hull_points": 400, "most": 1500}
 VARIANTS = [SpacetimeGaussians, SpacetimeGaussiansLite]

@@ -8,7 +8,7 @@ import trimesh
 
 from splashbench.observe import Bounds, ContainerShadow, Grid, Silhouettes, sequence_bounds, signed_distance_fields
 from splashbench.observe.container import depth_image, hidden, solid_distance
-from splashbench.observe.shadow import CarvingContainer
+from splashbench.observe.occlusion import CarvingContainer
 from splashbench.scene import Camera, ContainerMesh
 
 RADIUS = 0.25

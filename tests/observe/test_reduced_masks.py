@@ -7,7 +7,7 @@ import pytest
 
 from splashbench.observe import Bounds, Grid, Silhouettes
 from splashbench.observe.hull import carve_frame
-from splashbench.observe.reduced import ReducedScene, reduced
+from splashbench.observe.reduced_masks import ReducedScene, reduced
 from splashbench.parallel import each
 from splashbench.scene.camera import Camera
 

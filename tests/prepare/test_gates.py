@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.gates import Gate, mask_gates, pixel_limit, pose_gates, require, source_gate, sync_gates
 from splashbench.prepare.masks.provider import mask_health
-from splashbench.prepare.posing.poses import Poses
-from splashbench.prepare.sound.sync import ClockFit, SequenceSync
+from splashbench.prepare.poses.structure_from_motion import Poses
 
 
 @pytest.mark.parametrize(

@@ -20,19 +20,19 @@ from pydantic import TypeAdapter
 
 from splashbench.cli import prepare as cli_prepare
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.audio.clocks import Listening
+from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.board import BoardView
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.container.stage import PlacedContainer
-from splashbench.prepare.film.motion import MotionInterval
-from splashbench.prepare.film.sampling import Sampling
-from splashbench.prepare.masks.making import CameraMasks
-from splashbench.prepare.posing.metric import MetricFrame, Sighting, Similarity
-from splashbench.prepare.posing.rig import PosedRig
-from splashbench.prepare.posing.scale import SceneFrame
-from splashbench.prepare.sound.listening import Listening
-from splashbench.prepare.sound.sync import ClockFit, SequenceSync
-from splashbench.prepare.stages import STAGES, StageStore, facts_of, open_stages
+from splashbench.prepare.container import PlacedContainer
+from splashbench.prepare.masks.production import CameraMasks
+from splashbench.prepare.poses.metric import MetricFrame, Sighting, Similarity
+from splashbench.prepare.poses.rig import PosedRig
+from splashbench.prepare.poses.scale import SceneFrame
+from splashbench.prepare.stage_cache import STAGES, StageStore, facts_of, open_stages
+from splashbench.prepare.video.motion import MotionInterval
+from splashbench.prepare.video.sampling import Sampling
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ CHAIN = """
 import sys, time
 from pathlib import Path
 import numpy as np
-from splashbench.prepare.stages import STAGES, open_stages
+from splashbench.prepare.stage_cache import STAGES, open_stages
 
 with open_stages(Path(sys.argv[1])) as store:
     print("begun", flush=True)

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from splashbench.render.torch_threads import one_torch_thread
+from splashbench.gaussians.torch_threads import one_torch_thread
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 
-from splashbench.adapter.runner import run_method
 from splashbench.cli.score import _summary
+from splashbench.harness.runner import run_method
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.report.leaderboard import leaderboard_rows

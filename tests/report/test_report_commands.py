@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splashbench.adapter.oracle import write_oracle
 from splashbench.cli import leaderboard, score
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_image
+from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Scene
 from splashbench.score import Result
 from splashbench.submission import Identity, Record, Status, Submission, seal, write_view

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from splashbench.adapter.training_view import make_training_view
 from splashbench.errors import SplashbenchError
+from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import ContainerMesh, Scene
 from splashbench.scene.container import read_mesh
-from splashbench.synth.geometry import bowl_mesh
+from splashbench.synth.imaging.geometry import bowl_mesh
 
 PLY = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splashbench.adapter.training_view import make_training_view
 from splashbench.errors import SplashbenchError
+from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Scene
 from splashbench.scene.checking import check_scene, describe_scene
 from splashbench.study.scenes import changed_scene

@@ -5,8 +5,8 @@ import pytest
 
 from splashbench.observe.grid import Grid
 from splashbench.scene import SignedDistance
-from splashbench.score.level_set import chamfer, filled, overlap, resampled, surface_points
-from splashbench.score.particle_surface import particle_distance, spacing
+from splashbench.score.particles.surface import particle_distance, spacing
+from splashbench.score.truth.level_set import chamfer, filled, overlap, resampled, surface_points
 
 SHAPE = (48, 44, 44)
 MIDDLE = np.array([22.3, 21.6, 21.9])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from splashbench.score.image import outside_filled, psnr, ssim
-from splashbench.score.silhouette import iou, spill, spill_rgb
-from splashbench.score.temporal import JitterError
+from splashbench.score.image.fidelity import outside_filled, psnr, ssim
+from splashbench.score.image.jitter import JitterError
+from splashbench.score.image.silhouette import iou, spill, spill_rgb
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import pytest
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_image
-from splashbench.score import lpips as module
-from splashbench.score.lpips import Lpips, load_lpips
+from splashbench.score.image.fidelity import lpips as module
+from splashbench.score.image.lpips import Lpips, load_lpips
 
 
 @pytest.fixture

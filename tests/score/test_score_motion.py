@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splashbench.scene import Particles
-from splashbench.score.motion import FrameMotion, frame_motion, free_flight, known_velocities
+from splashbench.score.truth.motion import FrameMotion, frame_motion, free_flight, known_velocities
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 

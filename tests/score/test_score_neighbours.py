@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from splashbench.score import neighbours
-from splashbench.score.neighbours import nearest_poly6_sums
+from splashbench.score.particles import neighbours
+from splashbench.score.particles.neighbours import nearest_poly6_sums
 
 RADIUS = 0.3
 

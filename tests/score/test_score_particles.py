@@ -7,10 +7,10 @@ import pytest
 
 from splashbench.observe.consistency import inside_mask
 from splashbench.scene import Camera, Particles
-from splashbench.score.density import frame_density, poly6_densities
-from splashbench.score.energy import energy_deviation
+from splashbench.score.particles.density import frame_density, poly6_densities
+from splashbench.score.particles.energy import energy_deviation
+from splashbench.score.particles.uniformity import frame_uniformity, shell_points
 from splashbench.score.settings import Protocol
-from splashbench.score.uniformity import frame_uniformity, shell_points
 
 UP = np.array([0.0, 1.0, 0.0])
 

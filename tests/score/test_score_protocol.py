@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splashbench.adapter.oracle import write_oracle
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
+from splashbench.harness.oracle import write_oracle
 from splashbench.observe.consistency import inside_mask
 from splashbench.scene import Particles, Scene
 from splashbench.score import METRICS, PROTOCOL_V1, Protocol, Result, score_submission, shared_fields

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splashbench.adapter.oracle import write_oracle
 from splashbench.errors import SplashbenchError
+from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.score import Result, score_submission, shared_fields
-from splashbench.score.ground_truth import NO_TRUTH, true_geometry, true_spacing
 from splashbench.score.metrics import TRUTH_METRICS
+from splashbench.score.truth.comparison import NO_TRUTH, true_geometry, true_spacing
 from splashbench.submission import Submission, check_submission, seal
 
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from splashbench.adapter.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.scene import Camera, Particles, TrainingScene
 
 

@@ -8,10 +8,10 @@ import pytest
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
 from splashbench.scene.checking import check_scene
-from splashbench.study.perturb import EmptyMasks, MissingParts, empty_masks, missing_parts, without_part
+from splashbench.study.perturbation import EmptyMasks, MissingParts, empty_masks, missing_parts, without_part
 from splashbench.study.scenes import changed_scene, changes
 from splashbench.study.spec import Variant
-from splashbench.study.views import azimuths, nested_views
+from splashbench.study.view_subsets import azimuths, nested_views
 
 RAW = Variant(
     name="raw",

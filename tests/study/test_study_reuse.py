@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splashbench_methods.scaffold_gs import BackgroundSettings, fit_background, shared_background
 
-from splashbench.adapter.contract import Run
-from splashbench.adapter.reuse import training_digest
+from splashbench.harness.contract import Run
+from splashbench.harness.reuse import training_digest
 from splashbench.scene import Scene
+from splashbench_methods.scaffold_gs import BackgroundSettings, fit_background, shared_background
 
 
 def _part(run: Run, balls: Scene, value: str = "a", seconds: float = 0.0, **key: object) -> str:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splashbench.adapter.oracle import write_oracle
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
+from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Scene
 from splashbench.submission import Submission, check_submission, to_8bit
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splashbench.synth.plan import Options
+from splashbench.synth.recording.plan import Options
 
 SMALL = Options(size=(128, 72), fps=20, seed=3, duration=0.7, particle_radius=0.005)
 
@@ -18,6 +18,6 @@ def small_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for module in ("pysplishsplash", "pysplashsurf", "embreex"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed (splashbench[synth])")
-    from splashbench.synth.session import make_session
+    from splashbench.synth.recording.session import make_session
 
     return make_session(tmp_path_factory.mktemp("synth") / "session", SMALL)

@@ -7,8 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splashbench.synth.audio import SAMPLE_RATE, SPEED_OF_SOUND, Microphone, clap, interpolate, pouring, record
-from splashbench.synth.video import write_recording
+from splashbench.synth.recording.audio import (
+    SAMPLE_RATE,
+    SPEED_OF_SOUND,
+    Microphone,
+    clap,
+    interpolate,
+    pouring,
+    record,
+)
+from splashbench.synth.recording.video import write_recording
 
 
 def decoded(path: Path) -> tuple[np.ndarray, float]:

@@ -9,13 +9,22 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from splashbench.synth import shading
-from splashbench.synth.geometry import LOOK_AT, TANK_SIZE, TANK_WALL, Mesh, arc_point, look_at, revolve, tank_mesh
-from splashbench.synth.glass import ABSORPTION, Glass
-from splashbench.synth.lens import LensCamera
-from splashbench.synth.raycast import FAR, Tracer
-from splashbench.synth.rendering import Stage, View, thickness
-from splashbench.synth.room import Room, tank_room
+from splashbench.synth.imaging import shading
+from splashbench.synth.imaging.geometry import (
+    LOOK_AT,
+    TANK_SIZE,
+    TANK_WALL,
+    Mesh,
+    arc_point,
+    look_at,
+    revolve,
+    tank_mesh,
+)
+from splashbench.synth.imaging.glass import ABSORPTION, Glass
+from splashbench.synth.imaging.raycast import FAR, Tracer
+from splashbench.synth.imaging.rendering import Stage, View, thickness
+from splashbench.synth.imaging.room import Room, tank_room
+from splashbench.synth.recording.lens import LensCamera
 
 
 @pytest.fixture(scope="module")

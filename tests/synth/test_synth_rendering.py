@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from splashbench.synth.geometry import LOOK_AT, Mesh, Quad, arc_point, bowl_mesh, look_at, revolve
-from splashbench.synth.lens import LensCamera, distort, undistort
-from splashbench.synth.rendering import Stage, View
-from splashbench.synth.room import Room
+from splashbench.synth.imaging.geometry import LOOK_AT, Mesh, Quad, arc_point, bowl_mesh, look_at, revolve
+from splashbench.synth.imaging.rendering import Stage, View
+from splashbench.synth.imaging.room import Room
+from splashbench.synth.recording.lens import LensCamera, distort, undistort
 
 DISTORTION = np.array([-0.13, 0.04, 5e-4, -6e-4, 0.0])
 

@@ -14,7 +14,7 @@ from splashbench.cli import synth as command
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
-from splashbench.synth.plan import Options, make_plan
+from splashbench.synth.recording.plan import Options, make_plan
 from splashbench.synth.scenes import RECIPES, make_scene
 
 

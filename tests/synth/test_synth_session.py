@@ -12,10 +12,10 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray
 from splashbench.prepare.session import Session
-from splashbench.synth.audio import SAMPLE_RATE, SPEED_OF_SOUND, clap, interpolate
-from splashbench.synth.plan import CAMERAS, CHAPTERED, Options, make_plan
-from splashbench.synth.session import make_session
-from splashbench.synth.truth import Truth
+from splashbench.synth.recording.audio import SAMPLE_RATE, SPEED_OF_SOUND, clap, interpolate
+from splashbench.synth.recording.plan import CAMERAS, CHAPTERED, Options, make_plan
+from splashbench.synth.recording.session import make_session
+from splashbench.synth.recording.truth import Truth
 
 av = pytest.importorskip("av")
 
@@ -192,7 +192,7 @@ def test_settings_that_cannot_work_are_refused(
 def test_a_missing_library_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from splashbench.synth import simulation
+    from splashbench.synth.liquid import simulation
 
     def refuse() -> None:
         def load(name: str) -> None:
@@ -214,8 +214,8 @@ def test_the_default_session_can_be_calibrated(tmp_path: Path) -> None:
     """At the default size the boards are read in every camera, and the lenses come back to within 0.3 %."""
     import cv2
 
-    from splashbench.synth.plan import BOARD
-    from splashbench.synth.texture import charuco_board
+    from splashbench.synth.imaging.texture import charuco_board
+    from splashbench.synth.recording.plan import BOARD
 
     session = make_session(tmp_path / "session", Options())
     facts = Truth(session).file.cameras

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.synth import simulation
-from splashbench.synth.geometry import bowl_mesh
-from splashbench.synth.simulation import Pour, check_libraries, start
-from splashbench.synth.trajectory import Trajectory, assemble
+from splashbench.synth.imaging.geometry import bowl_mesh
+from splashbench.synth.liquid import simulation
+from splashbench.synth.liquid.simulation import Pour, check_libraries, start
+from splashbench.synth.liquid.trajectory import Trajectory, assemble
 
 QUICK = Pour(duration=0.45, emit_until=0.4, particle_radius=0.005)
 

@@ -15,9 +15,9 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray, write_json
 from splashbench.scene import Camera, Scene, SceneMeta, write_scene
-from splashbench.synth.lens import distort
-from splashbench.synth.truth import Truth
-from splashbench.synth.verify import align, verify_scene
+from splashbench.synth.recording.lens import distort
+from splashbench.synth.recording.truth import Truth
+from splashbench.synth.recording.verification import align, verify_scene
 
 SCALE = 7.0  # scene units per metre
 TURN = Rotation.from_euler("xyz", [0.3, -0.8, 0.5]).as_matrix()

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import MIN_CORNERS, BoardView, Detector, collinear, image_size
+from splashbench.prepare.calibration.determinism import one_opencv_thread
 from splashbench.prepare.calibration.lens import OPENCV_PIXEL_SHIFT, Array, Lens
-from splashbench.prepare.calibration.repeatable import one_opencv_thread
 
 MAX_FRAMES_SEARCHED = 150  # evenly spread over the clip; more adds time and near-copies
 MAX_VIEWS = 50

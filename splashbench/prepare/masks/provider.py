@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray
-from splashbench.prepare.stages import facts_of
+from splashbench.prepare.stage_cache import facts_of
 
 # Liquid that fills more than this share of a frame is a mask of everything.
 MAX_AREA_SHARE = 0.6

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.masks.provider import Mask
 from splashbench.prepare.masks.sam3_checkpoint import Sam3Checkpoint, seeded
-from splashbench.prepare.masks.sam3_following import ReadFrames, follow
+from splashbench.prepare.masks.sam3_tracking import ReadFrames, follow
 from splashbench.prepare.session import Click
-from splashbench.prepare.stages import facts_of
+from splashbench.prepare.stage_cache import facts_of
 
 DEFAULT_TEXT = "liquid"
 DEFAULT_CONFIDENCE = 0.5

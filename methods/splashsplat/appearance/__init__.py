@@ -1,0 +1,1 @@
+"""How the carriers look: features decoded into Gaussians, and their fit to the photographs (paper, "Optimization")."""

@@ -1,0 +1,192 @@
+"""Decoding carriers into Gaussians (paper, "Decoding Carriers into Gaussians", Eqs. child_position and sdf_opacity).
+
+Heads shared by all carriers and frames turn a carrier's feature f into K children in its frame A = F diag(s): offset,
+scale and opacity by linear heads, colour by a two-layer perceptron that also sees the viewing direction.
+`Decoder.forward` is the definition, in plain torch; `Decoder.decode` computes the same, on the CPU by the kernel of
+splashbench_methods.splashsplat.kernel.decode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ..kernel.decode import Heads, Instant, decode
+from . import losses
+
+# Where the children start, in units of the offset bound: half a unit to either side, one unit apart as in the
+# supplement.
+_START_DIRECTIONS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+_START_DISTANCE = 0.5
+
+
+@dataclass(frozen=True)
+class DecoderSettings:
+    """offset_bound is beta, scale_range eta_s, opacity_slope kappa_alpha, opacity_band tau_alpha (transport voxels)."""
+
+    feature_size: int = 32
+    children: int = 2
+    colour_width: int = 64
+    offset_bound: float = 1.0
+    scale_range: float = 0.5
+    opacity_slope: float = 2.0
+    opacity_band: float = 3.0
+    opacity_bias: float = 1.0
+
+
+@dataclass
+class CarrierState:
+    """What the decoder needs of n active carriers at one instant.
+
+    positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels. visibility: [n] in [0, 1], by
+    which opacities are multiplied where the carriers are hidden from the view at hand; all are seen by default.
+    """
+
+    positions: Tensor
+    deformation: Tensor
+    phi: Tensor
+    visibility: Tensor | None = None
+
+
+@dataclass
+class Children:
+    """n carriers' K children: means [n, K, 3], factors [n, K, 3, 3] of their covariances B B^T (scene units), opacities
+    [n, K], colours [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units."""
+
+    means: Tensor
+    factors: Tensor
+    opacities: Tensor
+    colours: Tensor
+    offsets: Tensor
+
+
+@dataclass
+class ColourCells:
+    """Cells of space whose carriers should agree in colour.
+
+    of_carriers: int64 [n], numbered from 0 without gaps. sizes: float [cells], carriers in each.
+    """
+
+    of_carriers: Tensor
+    sizes: Tensor
+
+
+@dataclass
+class Penalties:
+    """What the objective says of the children themselves, scalars: `losses.covariance_loss` in squared scene units,
+    `separation_loss` and `colour_loss`."""
+
+    covariance: Tensor
+    separation: Tensor
+    colour: Tensor
+
+
+def penalties(children: Children, cells: ColourCells) -> Penalties:
+    """The penalties on children, in plain torch."""
+    return Penalties(
+        losses.covariance_loss(children.factors, voxel=1.0),
+        losses.separation_loss(children.offsets),
+        losses.colour_loss(children.colours, cells.of_carriers, cells.sizes),
+    )
+
+
+class Decoder(nn.Module):
+    """The heads g_o, g_s, g_alpha (linear) and g_c (two layers)."""
+
+    def __init__(self, settings: DecoderSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        size, k = settings.feature_size, settings.children
+        self.offset = nn.Linear(size, 3 * k)
+        self.scale = nn.Linear(size, 3 * k)
+        self.opacity = nn.Linear(size, k)
+        self.colour_hidden = nn.Linear(size + 3, settings.colour_width)
+        self.colour_out = nn.Linear(settings.colour_width, 3 * k)
+        with torch.no_grad():
+            for head in (self.offset, self.scale, self.opacity):
+                head.weight.mul_(0.3)  # children start alike, near the values the biases give
+            self.scale.bias.zero_()
+            self.opacity.bias.fill_(settings.opacity_bias)
+            starts = torch.tensor([_START_DIRECTIONS[i % 6] for i in range(k)], dtype=torch.float32)
+            starts = starts * (_START_DISTANCE if k > 1 else 0.0) / settings.offset_bound
+            self.offset.bias.copy_(torch.atanh(starts.clamp(-0.99, 0.99)).reshape(-1))
+
+    def offsets(self, features: Tensor) -> Tensor:
+        """o = beta tanh(g_o(f)), [n, K, 3]."""
+        raw = self.offset(features).view(len(features), self.settings.children, 3)
+        return self.settings.offset_bound * torch.tanh(raw)
+
+    def forward(self, features: Tensor, log_scales: Tensor, state: CarrierState, eye: Tensor) -> Children:
+        """Children of n carriers seen from `eye` [3].
+
+        features: [n, feature_size]; log_scales: [n, 3], log of s in scene units.
+        """
+        s = self.settings
+        n, k = len(features), s.children
+        base = torch.exp(log_scales)
+        offsets = self.offsets(features)
+        local = (base[:, None] * offsets).transpose(1, 2)  # diag(s) o, [n, 3, K]
+        means = state.positions[:, None] + torch.bmm(state.deformation, local).transpose(1, 2)
+        # Sigma = B B^T with B = F diag(g) / sqrt(K). The residual is bounded: an unbounded exponent lets single
+        # Gaussians grow over the whole image.
+        residual = 2 * torch.tanh(0.5 * self.scale(features).view(n, k, 3))
+        extent = base[:, None] * torch.exp(s.scale_range * residual) / math.sqrt(k)
+        factors = state.deformation[:, None] * extent[:, :, None, :]
+        fade = torch.sigmoid(s.opacity_slope * (s.opacity_band - state.phi.abs()))
+        if state.visibility is not None:
+            fade = fade * state.visibility
+        opacities = torch.sigmoid(self.opacity(features)) * fade[:, None]
+        direction = nn.functional.normalize(state.positions - eye, dim=1)
+        hidden = torch.relu(self.colour_hidden(torch.cat([features, direction], dim=1)))
+        colours = torch.sigmoid(self.colour_out(hidden)).view(n, k, 3)
+        return Children(means, factors, opacities, colours, offsets)
+
+    def decode(
+        self,
+        features: Tensor,
+        log_scales: Tensor,
+        rows: Tensor | None,
+        state: CarrierState,
+        eye: Tensor,
+        cells: ColourCells | None = None,
+    ) -> tuple[Children, Penalties | None]:
+        """Children of the carriers `rows` (int64 [n], ascending; None for all) of the tables, as `forward` has them,
+        and with `cells` also the penalties on them. With `rows` the gradients of the tables are sparse."""
+        tables = (features, log_scales)
+        if all(table.device.type == "cpu" and table.dtype == torch.float32 for table in tables):
+            groups = () if cells is None else (cells.of_carriers, len(cells.sizes))
+            instant = Instant(state.positions, state.deformation, state.phi, eye, state.visibility, *groups)
+            *children, terms = decode(self.heads(), *tables, instant, rows)
+            return Children(*children), None if terms is None else Penalties(*terms.unbind())
+        if rows is not None:
+            features, log_scales = (nn.functional.embedding(rows, table, sparse=True) for table in tables)
+        result = self(features, log_scales, state, eye)
+        return result, None if cells is None else penalties(result, cells)
+
+    def heads(self) -> Heads:
+        """The heads as the kernel takes them."""
+        s = self.settings
+        return Heads(
+            offset=(self.offset.weight, self.offset.bias),
+            scale=(self.scale.weight, self.scale.bias),
+            opacity=(self.opacity.weight, self.opacity.bias),
+            hidden=(self.colour_hidden.weight, self.colour_hidden.bias),
+            color=(self.colour_out.weight, self.colour_out.bias),
+            offset_bound=s.offset_bound,
+            scale_range=s.scale_range,
+            opacity_slope=s.opacity_slope,
+            opacity_band=s.opacity_band,
+            separation_margin=losses.SEPARATION_MARGIN,
+        )
+
+    def mean_opacity(self, features: Tensor) -> Tensor:
+        """Learned opacity of each carrier, the mean over its children without the fade by phi: [n]."""
+        return torch.sigmoid(self.opacity(features)).mean(dim=1)
+
+
+def initial_log_scale(base_scale: float, voxel: float) -> float:
+    """log of s for carriers whose extent is `base_scale` transport voxels of size `voxel` (scene units)."""
+    return math.log(base_scale * voxel)

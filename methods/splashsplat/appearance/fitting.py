@@ -1,0 +1,225 @@
+"""Optimising features, base scales and heads by rendering (paper, "Optimization").
+
+Each iteration takes one time-camera pair, decodes the carriers active then, rasterises them over the frozen
+background and descends on the seven losses. Carriers' positions and deformations are given (carriers.py) and stay as
+they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splashbench.errors import SplashbenchError
+from splashbench.render import rasterize
+from splashbench.scene.camera import Camera
+
+from ..kernel.window_loss import window_losses
+from ..subframe import Track
+from . import losses
+from .decoder import Children, ColourCells, Decoder, DecoderSettings, Penalties, initial_log_scale
+from .optimizer import RowAdam
+from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
+from .shared_features import SharedFeatures
+from .targets import Target
+
+# Iterations between two looks at the withheld photographs.
+_LOOK_EVERY = 100
+# Iterations in which the learning rates fall, as a share of those before.
+_FALL = 0.5
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of the optimisation.
+
+    iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
+    anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. withheld_share: of the
+    photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
+    `AdaptiveSchedule`. shared_cells: see `SharedFeatures`; learning_rate_shared is that of the shared parts.
+    """
+
+    iterations: int = 1000
+    withheld_share: float = 0.0
+    stop_gain: float = 0.01
+    learning_rate_features: float = 0.06
+    learning_rate_shared: float = 0.02
+    shared_cells: tuple[float, ...] = ()
+    learning_rate_heads: float = 0.015
+    learning_rate_scales: float = 1e-2
+    anneal: bool = True
+    ssim_every: int = 1
+    base_scale: float = 0.35
+    weights: losses.LossWeights = field(default_factory=losses.LossWeights)
+
+
+@dataclass
+class Appearance:
+    """What the fit learns: features [count, size] and log_scales [count, 3] of the carriers, and the heads."""
+
+    features: Tensor
+    log_scales: Tensor
+    decoder: Decoder
+
+
+def initial_appearance(
+    count: int, voxel: float, settings: FitSettings, decoder: DecoderSettings, seed: int
+) -> Appearance:
+    """Appearance before the fit; the same for the same seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        features = 0.1 * torch.randn(count, decoder.feature_size)
+        heads = Decoder(decoder)
+    return Appearance(features, torch.full((count, 3), initial_log_scale(settings.base_scale, voxel)), heads)
+
+
+def composite(children: Children, camera: Camera, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Liquid over the background (liquid in front): rgb [h, w, 3] and the liquid's opacity [h, w]."""
+    image: Tensor
+    alpha: Tensor
+    image, alpha = rasterize(
+        children.means.flatten(0, 1),
+        children.factors.flatten(0, 1),
+        children.opacities.flatten(),
+        children.colours.flatten(0, 1),
+        camera,
+        background=background,
+    )
+    return image, alpha
+
+
+def image_loss(image: Tensor, alpha: Tensor, target: Target, weights: losses.LossWeights, ssim_weight: float) -> Tensor:
+    """The weighted sum of the terms that compare images (Eq. total_loss); `ssim_weight` replaces weights.ssim."""
+    foreground, gradient, silhouette = window_losses(image, alpha, target.photograph)
+    loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / target.area
+    if ssim_weight > 0:
+        truth = target.photograph.image.to(torch.float32) / 255
+        loss = loss + ssim_weight * losses.ssim_loss(image[target.photograph.box], truth)
+    return loss
+
+
+def penalty_loss(penalties: Penalties, voxel: float, weights: losses.LossWeights) -> Tensor:
+    """The weighted sum of the other terms."""
+    return (
+        weights.covariance * penalties.covariance / voxel**2
+        + weights.separation * penalties.separation
+        + weights.colour * penalties.colour
+    )
+
+
+def _colour_cells(track: Track, t: int, size: float) -> ColourCells:
+    """The cells of frame `t`'s carriers, of `size` transport voxels."""
+    keys = np.floor(track.carriers.positions[track.carriers.rows(t)] / size).astype(np.int64)
+    _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    return ColourCells(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32)))
+
+
+def fit_appearance(
+    appearance: Appearance,
+    track: Track,
+    targets: list[Target],
+    settings: FitSettings,
+    colour_cell: float,
+    seed: int,
+    progress: Callable[[float], None],
+) -> list[float]:
+    """Fit `appearance` in place; the loss of every iteration is returned. `colour_cell`: in transport voxels.
+
+    Raises SplashbenchError where the loss stops being finite.
+    """
+    frames = range(track.carriers.n_frames)
+    states, ids = [track.state(t) for t in frames], [track.ids(t) for t in frames]
+    cells = [_colour_cells(track, t, colour_cell) for t in frames]
+    decoder = appearance.decoder
+    parameters = list(decoder.parameters())
+    heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
+    scales = RowAdam(appearance.log_scales, settings.learning_rate_scales)
+    features = SharedFeatures(
+        appearance.features,
+        track.carriers,
+        ids,
+        settings.shared_cells,
+        settings.learning_rate_features,
+        settings.learning_rate_shared,
+        seed,
+    )
+    rng = np.random.default_rng([seed, 1])
+    held = np.zeros(len(targets), dtype=bool)
+    schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
+    if settings.withheld_share > 0:
+        adaptive = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+        if adaptive.may_stop:
+            held = withheld(len(targets), settings.withheld_share, np.random.default_rng([seed, 3]))
+        if held.any() or not adaptive.may_stop:
+            schedule = adaptive
+
+    def seen(
+        target: Target, frame_features: Tensor, frame_scales: Tensor, penalised: bool
+    ) -> tuple[Tensor, Tensor, Penalties | None]:
+        # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
+        state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
+        state = replace(state, visibility=target.visibility)
+        of_cells = cells[target.frame] if penalised else None
+        children, found = decoder.decode(frame_features, frame_scales, None, state, target.eye, of_cells)
+        return *composite(children, target.camera, target.background), found
+
+    def of_frame(t: int) -> tuple[Tensor, Tensor]:
+        return features.of_frame(t), appearance.log_scales.index_select(0, ids[t])
+
+    @torch.no_grad()
+    def loss_of_withheld() -> float:
+        weights, total = settings.weights, 0.0
+        for number in np.nonzero(held)[0]:
+            target = targets[number]
+            image, alpha, _ = seen(target, *of_frame(target.frame), penalised=False)
+            total += float(image_loss(image, alpha, target, weights, weights.ssim))
+        return total / int(held.sum())
+
+    queue: list[int] = []
+    history: list[float] = []
+    iteration = 0
+    while True:
+        if schedule.due(iteration):
+            schedule.look(iteration, loss_of_withheld())
+        factor = schedule.factor(iteration)
+        if factor is None:
+            break
+        if not queue:
+            fitted = np.nonzero(~held)[0] if schedule.withholds else np.arange(len(targets))
+            queue = rng.permutation(fitted).tolist()
+        target = targets[queue.pop()]
+        active = [values.requires_grad_() for values in of_frame(target.frame)]
+        image, alpha, found = seen(target, active[0], active[1], penalised=True)
+        assert found is not None
+        with_ssim = iteration % settings.ssim_every == 0
+        ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
+        loss = image_loss(image, alpha, target, settings.weights, ssim_weight)
+        loss = loss + penalty_loss(found, track.grid.voxel, settings.weights)
+        history.append(float(loss.detach()))
+        if not math.isfinite(history[-1]):
+            raise SplashbenchError(
+                f"the loss of splashsplat is {history[-1]} at iteration {iteration + 1}; lower the learning rates"
+            )
+        by_feature, by_scale, *by_head = torch.autograd.grad(loss, [*active, *parameters])
+        for parameter, gradient in zip(parameters, by_head):
+            parameter.grad = gradient
+        for group in heads.param_groups:
+            group["lr"] = settings.learning_rate_heads * factor
+        heads.step()
+        features.step(target.frame, by_feature, factor)
+        scales.step(ids[target.frame], by_scale, factor)
+        iteration += 1
+        progress(schedule.done(iteration))
+    appearance.features = features.all()
+    return history
+
+
+@torch.no_grad()
+def visible_carriers(appearance: Appearance, threshold: float) -> np.ndarray:
+    """bool [count]: carriers whose learned opacity reached `threshold`; the others are phantoms of the hull."""
+    return (appearance.decoder.mean_opacity(appearance.features) >= threshold).numpy()

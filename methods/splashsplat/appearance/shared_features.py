@@ -1,0 +1,109 @@
+"""Features that carriers share while they are fitted: what is near in space and time looks alike.
+
+A carrier lasts a few frames and a handful of photographs show it; alone, it learns what it looks like from these. So
+its feature is a sum: its own part, and one for each size of cell, which it shares with every carrier that was born in
+the same cell of space and time. A photograph then teaches neighbours, too, and what no photograph tells of one carrier
+it has from them. At the end the sum is kept: decoder and files know nothing of the parts. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..carriers.tracking import Carriers
+from .optimizer import RowAdam
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Cells of one size. cells: int64 [count] of all carriers. table: [cells, width], what each cell adds. rows,
+    members: per frame the cells of its carriers, ascending, and which of these each carrier is in."""
+
+    cells: Tensor
+    table: Tensor
+    adam: RowAdam
+    rows: list[Tensor]
+    members: list[Tensor]
+
+
+class SharedFeatures:
+    """The features of `carriers` as sums; see above.
+
+    own: float32 [count, width], the carriers' own parts at first; updated in place. ids: int64 [n] of each frame, its
+    carriers' rows there. sizes: of the cells, in transport voxels and, by the same number, in frames; none where
+    nothing is shared. own_rate, shared_rate: of learning.
+    """
+
+    def __init__(
+        self,
+        own: Tensor,
+        carriers: Carriers,
+        ids: list[Tensor],
+        sizes: Sequence[float],
+        own_rate: float,
+        shared_rate: float,
+        seed: int,
+    ) -> None:
+        self._own, self._adam = own, RowAdam(own, own_rate)
+        self._ids = ids
+        self._levels: list[_Level] = []
+        if not sizes:
+            return
+        born = births(carriers)
+        # Cells of different sizes have their faces at different places.
+        rng = np.random.default_rng([seed, 4])
+        for size in sizes:
+            cells = torch.from_numpy(cells_of(born, size, rng.random(4)))
+            table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
+            found = [torch.unique(cells.index_select(0, ids), return_inverse=True) for ids in self._ids]
+            rows, members = [rows for rows, _ in found], [members for _, members in found]
+            self._levels.append(_Level(cells, table, RowAdam(table, shared_rate), rows, members))
+
+    def of_frame(self, t: int) -> Tensor:
+        """Features of the carriers of frame `t`, [n, width]."""
+        return self._sum(self._ids[t])
+
+    def all(self) -> Tensor:
+        """Features of all carriers, [count, width]."""
+        return self._sum(torch.arange(len(self._own)))
+
+    def step(self, t: int, gradient: Tensor, factor: float) -> None:
+        """Descend along the `gradient` [n, width] of frame `t`'s features; `factor` scales the rates."""
+        self._adam.step(self._ids[t], gradient, factor)
+        for level in self._levels:
+            rows = level.rows[t]
+            summed = gradient.new_zeros(len(rows), gradient.shape[1]).index_add_(0, level.members[t], gradient)
+            level.adam.step(rows, summed, factor)
+
+    def _sum(self, ids: Tensor) -> Tensor:
+        features = self._own.index_select(0, ids)
+        for level in self._levels:
+            features += level.table.index_select(0, level.cells.index_select(0, ids))
+        return features
+
+
+def births(carriers: Carriers) -> np.ndarray:
+    """Where (transport-grid coordinates) and when (frames) each carrier was born, float64 [count, 4]."""
+    first, _ = carriers.births_and_ends()
+    born = np.zeros((carriers.count, 4))
+    born[:, 3] = first
+    for t in range(carriers.n_frames):
+        rows = carriers.rows(t)
+        new = first[carriers.ids[rows]] == t
+        born[carriers.ids[rows][new], :3] = carriers.positions[rows][new]
+    return born
+
+
+def cells_of(born: np.ndarray, size: float, shift: np.ndarray) -> np.ndarray:
+    """The cell of each of `born` [count, 4] (see `births`), int64 [count] numbered from 0 without gaps.
+
+    size: of a cell, in transport voxels and in frames. shift: [4] where its faces are along x, y, z and time, in cells.
+    """
+    keys = np.floor(born / size + shift).astype(np.int64)
+    _, cells = np.unique(keys, axis=0, return_inverse=True)
+    return cells.reshape(-1)

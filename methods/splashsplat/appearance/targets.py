@@ -1,0 +1,138 @@
+"""Training targets: for each time-camera pair, the window of the image that the liquid and its carriers cover.
+
+Outside the window neither mask nor carriers reach, so the losses lose nothing by leaving it out, and rasterising the
+window alone is several times cheaper than the whole view. Of photograph and mask a target keeps the mask's bounding box
+and 8 pixels around it, at four bytes a pixel; backgrounds are shared.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splashbench.scene.camera import Camera
+from splashbench.scene.scene import TrainingScene
+
+from ..kernel.window_loss import Photograph
+from ..subframe import Track, locate
+
+MASK_MARGIN = 8
+# A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
+SAME_TIME = 0.01
+
+
+@dataclass
+class Target:
+    """One time-camera pair.
+
+    frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
+    window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
+    kept. background: float32 [h, w, 3] in [0, 1], a view of the camera's own. area: pixels over which the silhouette
+    term averages. hidden: bool [n], carriers of the frame that the container hides from the view, or None.
+    """
+
+    frame: int
+    fraction: float
+    camera: Camera
+    eye: Tensor
+    photograph: Photograph
+    background: Tensor
+    area: float
+    hidden: Tensor | None = None
+
+    @property
+    def visibility(self) -> Tensor | None:
+        """1 for the carriers that the view can see and 0 for those that the container hides, float32 [n], or None."""
+        return None if self.hidden is None else 1 - self.hidden.to(torch.float32)
+
+
+def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1 of the bounding box of `mask` (not empty) grown by `margin`, within the image."""
+    rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
+    height, width = mask.shape
+    return (
+        max(int(columns[0]) - margin, 0),
+        max(int(rows[0]) - margin, 0),
+        min(int(columns[-1]) + 1 + margin, width),
+        min(int(rows[-1]) + 1 + margin, height),
+    )
+
+
+def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) -> tuple[int, int, int, int]:
+    """`box` grown so that it holds the projections of `points` too, within the image."""
+    pixels, depth = camera.project(points)
+    pixels = pixels[depth > 0]
+    if len(pixels) == 0:
+        return box
+    low = np.floor(pixels.min(axis=0)).astype(int) - MASK_MARGIN
+    high = np.ceil(pixels.max(axis=0)).astype(int) + MASK_MARGIN
+    return (
+        int(np.clip(low[0], 0, box[0])),
+        int(np.clip(low[1], 0, box[1])),
+        int(np.clip(high[0], box[2], camera.width)),
+        int(np.clip(high[1], box[3], camera.height)),
+    )
+
+
+def collect_targets(
+    scene: TrainingScene,
+    backgrounds: dict[str, np.ndarray],
+    track: Track,
+    silhouette_norm: str,
+    camera_times: bool = False,
+    trusted: np.ndarray | None = None,
+    hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
+) -> list[Target]:
+    """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
+
+    backgrounds: float32 [H, W, 3] of each training view. camera_times: whether a photograph shows the liquid at its
+    camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name and
+    positions [n, 3], which of them the container hides (bool [n]). silhouette_norm: "image" averages the silhouette
+    term over the view's sequence-wide liquid window (the paper's images are such crops), "mask" over the mask.
+    """
+    targets = []
+    for view, name in enumerate(scene.train):
+        camera = scene.cameras[name]
+        masks = [scene.mask(name, t) for t in range(scene.n_frames)]
+        ever = functools.reduce(np.logical_or, masks)
+        if not ever.any():
+            continue
+        x0, y0, x1, y1 = _extent(ever, MASK_MARGIN)
+        crop_area = float((x1 - x0) * (y1 - y0))
+        eye = torch.tensor(camera.center, dtype=torch.float32)
+        taken = scene.camera_times[name] if camera_times else scene.times
+        for t, mask in enumerate(masks):
+            if not mask.any() or (trusted is not None and not trusted[t, view]):
+                continue
+            frame, fraction = locate(scene.times, float(taken[t]))
+            fraction = fraction if abs(fraction) > SAME_TIME else 0.0
+            positions = track.state(frame, fraction).positions.numpy()
+            if len(positions) == 0:
+                continue
+            box = _extent(mask, MASK_MARGIN)
+            x0, y0, x1, y1 = _window(camera, box, positions)
+            part = slice(box[1], box[3]), slice(box[0], box[2])
+            photograph = Photograph(
+                torch.from_numpy(scene.image(name, t)[part].copy()),
+                torch.from_numpy(mask[part].copy()),
+                top=box[1] - y0,
+                left=box[0] - x0,
+            )
+            targets.append(
+                Target(
+                    frame=frame,
+                    fraction=fraction,
+                    camera=camera.cropped(x0, y0, x1 - x0, y1 - y0),
+                    eye=eye,
+                    photograph=photograph,
+                    background=torch.from_numpy(backgrounds[name])[y0:y1, x0:x1],
+                    area=crop_area if silhouette_norm == "image" else float(mask.sum()),
+                    hidden=None if hidden is None else torch.from_numpy(hidden(name, positions)),
+                )
+            )
+    return targets

@@ -1,0 +1,1 @@
+"""Carriers through forecast, correct, resample (paper, "Forecast, Correct, Resample")."""

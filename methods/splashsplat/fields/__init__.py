@@ -1,0 +1,1 @@
+"""Observation fields: signed distance, pool and jet, frame by frame (paper, "Observation fields")."""

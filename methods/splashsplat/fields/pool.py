@@ -1,0 +1,334 @@
+"""The pool: liquid that rests in a container is level (hydrostatics).
+
+Silhouettes say where liquid may be, not where it is: over a pool the visual hull is a dome, as high as the cameras look
+down. Two things are known of a pool beyond its silhouettes: it fills the container up to one height, and the outline
+of its surface is where that surface meets the container's wall. So the level is the height that best separates the
+part of the inner wall that masks cover from the part that they leave free, found per frame, and
+- below the level the container is full,
+- above it only that part of the hull stays which a view needs to explain its mask: what every view sees in front of
+  the pool is a phantom.
+Not in the paper. Needs the container's mesh and the direction of gravity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy.ndimage import binary_fill_holes
+
+from splashbench.observe.container import solid_distance
+from splashbench.observe.grid import Bounds, Grid
+from splashbench.observe.kernels import sample, trilinear
+from splashbench.observe.occlusion import focal_length
+from splashbench.observe.silhouettes import Silhouettes, signed_distance_2d
+from splashbench.parallel import over_range
+from splashbench.scene.camera import Camera
+from splashbench.scene.container import ContainerMesh
+
+from ..motion.ballistic import Jet
+
+VESSEL_CELLS = 96
+# Levels are tried this far apart, in vessel voxels; a pool explains the masks where they overlap by at least this.
+_LEVEL_STEP = 0.25
+_MIN_OVERLAP = 0.35
+# Nodes of a slice that walls must enclose for it to hold anything.
+_SMALLEST_ROOM = 4
+# Voxels about the surface within which distances matter.
+_NEAR = 3.0
+_SMALL_LOOP = 4096
+# Levels are the medians over so many frames to either side.
+_STEADY = 2
+# Views of larger liquid windows are looked at every so many pixels, so that this many remain along the longest side.
+_LONGEST_WINDOW = 480
+
+
+def upright(gravity: np.ndarray) -> np.ndarray:
+    """Rotation [3, 3] from scene axes to axes whose third points up, against `gravity` (unit vector)."""
+    up = -np.asarray(gravity, dtype=np.float64)
+    side = np.eye(3)[int(np.argmin(np.abs(up)))]
+    first = np.cross(side, up)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """Where a container can hold liquid.
+
+    turn: [3, 3] scene axes to upright ones. grid: over the container, upright axes, scene units. solid: float32, signed
+    distance to the walls in voxels, negative in them. inside: float32 of 0 and 1, free space that walls enclose
+    sideways. rim: greatest height of it, scene units.
+    """
+
+    turn: np.ndarray
+    grid: Grid
+    solid: np.ndarray
+    inside: np.ndarray
+    rim: float
+
+    @classmethod
+    def of(cls, mesh: ContainerMesh, gravity: np.ndarray, cells: int = VESSEL_CELLS) -> Vessel | None:
+        """The vessel that `mesh` is, or None where it encloses nothing (a plate, a mesh with holes)."""
+        turn = upright(gravity)
+        vertices = mesh.vertices @ turn.T
+        bounds = Bounds(vertices.min(axis=0), vertices.max(axis=0)).padded(0.08)
+        grid = Grid.over(bounds, cells)
+        solid = solid_distance(ContainerMesh(vertices, mesh.faces), grid)
+        wall = solid < 0.5  # half a voxel thicker, so that a thin wall has no holes between the nodes
+        inside = np.zeros(grid.shape, dtype=np.float32)
+        for k in range(grid.shape[2]):
+            filled = binary_fill_holes(wall[:, :, k])
+            if (filled & ~wall[:, :, k]).sum() >= _SMALLEST_ROOM:
+                inside[:, :, k] = filled & (solid[:, :, k] > 0)
+        levels = np.nonzero(inside.any(axis=(0, 1)))[0]
+        if len(levels) == 0:
+            return None
+        return cls(turn, grid, solid, inside, float(grid.origin[2] + grid.voxel * levels[-1]))
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Height of `points` [..., 3] (scene units), scene units above the scene's origin."""
+        return np.asarray(points) @ self.turn[2]
+
+    def room(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance of `points` [N, 3] (scene units) to the wall from within: float32 [N], scene units, negative
+        where the vessel can hold liquid, large elsewhere."""
+        nodes = self.grid.to_voxels(points @ self.turn.T)
+        beyond = np.abs(nodes - np.clip(nodes, 0, np.array(self.grid.shape) - 1)).max(axis=1) > 0
+        distance = -sample(self.solid, nodes)
+        enclosed = (sample(self.inside, nodes) > 0.25) | (distance > 0)
+        return np.where(enclosed & ~beyond, distance, 20).astype(np.float32) * np.float32(self.grid.voxel)
+
+    def walled(self, points: np.ndarray) -> np.ndarray:
+        """bool [N]: whether `points` [N, 3] (scene units) lie in the container's walls."""
+        return sample(self.solid, self.grid.to_voxels(points @ self.turn.T)) < 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lowest(
+    solid: np.ndarray,
+    inside: np.ndarray,
+    ray: np.ndarray,
+    eye: np.ndarray,
+    corner: np.ndarray,
+    stride: int,
+    opaque: bool,
+    heights: np.ndarray,
+    start: int,
+    stop: int,
+) -> None:
+    nx, ny, nz = solid.shape
+    top = np.array([nx - 1.0, ny - 1.0, nz - 1.0])
+    for row in range(start, stop):
+        v = corner[1] + row * stride + 0.5
+        for column in range(heights.shape[1]):
+            u = corner[0] + column * stride + 0.5
+            direction = ray[:, 0] * u + ray[:, 1] * v + ray[:, 2]
+            direction /= np.sqrt((direction**2).sum())
+            near, far = 0.0, 1e9
+            for axis in range(3):
+                if abs(direction[axis]) > 1e-12:
+                    a = -eye[axis] / direction[axis]
+                    b = (top[axis] - eye[axis]) / direction[axis]
+                    near, far = max(near, min(a, b)), min(far, max(a, b))
+                elif eye[axis] < 0 or eye[axis] > top[axis]:
+                    far = -1.0
+            lowest = np.inf
+            s = near
+            while s <= far:
+                x = eye[0] + s * direction[0]
+                y = eye[1] + s * direction[1]
+                z = eye[2] + s * direction[2]
+                if opaque and trilinear(solid, x, y, z) < 0:
+                    break
+                if inside[int(x + 0.5), int(y + 0.5), int(z + 0.5)] > 0:
+                    lowest = min(lowest, z)
+                s += 0.5
+            heights[row, column] = lowest
+
+
+def lowest_heights(
+    vessel: Vessel, camera: Camera, corner: np.ndarray, shape: tuple[int, int], stride: int, opaque: bool
+) -> np.ndarray:
+    """How deep each pixel looks into the vessel: float32 `shape`, scene units of height, inf where it does not.
+
+    Pixels are `stride` apart from `corner` (x, y). A pool covers a pixel when its level is above that height.
+    """
+    grid = vessel.grid
+    ray = vessel.turn @ camera.w2c[:3, :3].T @ np.linalg.inv(camera.K)
+    eye = (vessel.turn @ camera.center - grid.origin) / grid.voxel
+    heights = np.empty(shape, dtype=np.float32)
+    over_range(
+        _lowest, shape[0], vessel.solid, vessel.inside, ray, eye, corner.astype(np.float64), stride, opaque, heights
+    )
+    return (heights * np.float32(grid.voxel) + np.float32(grid.origin[2])).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class PoolView:
+    """One view's look into the vessel. stride, corner: of the pixels of `heights` (see `lowest_heights`)."""
+
+    camera: Camera
+    corner: np.ndarray
+    stride: int
+    heights: np.ndarray
+
+
+class Pool:
+    """Finds the level of the pool in each frame, and lowers the hull to it."""
+
+    def __init__(self, vessel: Vessel, silhouettes: Silhouettes, opaque: bool) -> None:
+        """opaque: whether the container hides what is behind its walls."""
+        self.vessel = vessel
+        self._silhouettes = silhouettes
+        self._room: _Room | None = None
+        self.views = []
+        for camera, window in zip(silhouettes.cameras, silhouettes.windows):
+            stride = max(1, -(-max(window.shape) // _LONGEST_WINDOW))
+            height, width = (max(-(-n // stride), 2) for n in window.shape)
+            heights = lowest_heights(vessel, camera, window.corner, (height, width), stride, opaque)
+            self.views.append(PoolView(camera, window.corner, stride, heights))
+        grid = vessel.grid
+        self._tried = grid.origin[2] + grid.voxel * np.arange(0, grid.shape[2], _LEVEL_STEP)
+
+    def levels(self) -> np.ndarray:
+        """Height of the pool in every frame, float64 [T] scene units, NaN where there is none; see `level`."""
+        found = np.array([self.level(t) for t in range(self._silhouettes.n_frames)])
+        trusted = found[:, 1] >= _MIN_OVERLAP
+        levels = np.full(len(found), np.nan)
+        for t in np.nonzero(trusted)[0]:
+            near = slice(max(t - _STEADY, 0), t + _STEADY + 1)
+            levels[t] = np.median(found[near, 0][trusted[near]])
+        return levels
+
+    def level(self, t: int) -> tuple[float, float]:
+        """Height of the pool (scene units) that explains the masks of frame `t` best, and how well: the overlap (IoU)
+        of what it covers and the masks, within what the views see of the vessel."""
+        covered, spilled = np.zeros(len(self._tried) + 1), np.zeros(len(self._tried) + 1)
+        for number, view in enumerate(self.views):
+            mask = self._silhouettes.mask(number, t)[:: view.stride, :: view.stride]
+            height, width = mask.shape
+            heights = view.heights[:height, :width]
+            looks = np.isfinite(heights)
+            if self._silhouettes.failed_masks[t, number] or not (mask & looks).any():
+                continue
+            bins = np.searchsorted(self._tried, heights[looks], side="left")
+            liquid = mask[looks]
+            covered += np.bincount(bins[liquid], minlength=len(covered)) / liquid.sum()
+            spilled += np.bincount(bins[~liquid], minlength=len(covered)) / liquid.sum()
+        if covered.sum() == 0:
+            return -np.inf, 0.0
+        overlap = np.cumsum(covered) / (covered.sum() + np.cumsum(spilled))
+        best = int(np.argmax(overlap[:-1]))
+        return float(self._tried[best]), float(overlap[best])
+
+    def lowered(
+        self,
+        phi: np.ndarray,
+        grid: Grid,
+        level: float,
+        shadows: Sequence[np.ndarray | None],
+        jet: Jet | None = None,
+    ) -> np.ndarray:
+        """`phi` (hull distance on `grid`, voxels) with a full pool up to `level` and without what every view explains
+        by it: float32 of the same shape.
+
+        shadows: per view the container's depth image, None where it hides nothing (observe/container.py). jet: what
+        falls into the pool is no phantom.
+        """
+        if self._room is None or self._room.grid is not grid:
+            self._room = _Room.of(self.vessel, grid)
+        room = self._room
+        settled = phi.copy()
+        flat = settled.reshape(-1)
+        doubtful = np.nonzero(flat < _NEAR)[0]
+        points = grid.to_scene(np.stack(np.unravel_index(doubtful, grid.shape), axis=1))
+        above = ((self.vessel.height(points) - level) / grid.voxel).astype(np.float32)
+        high = above > -1
+        doubtful, points, removal = doubtful[high], points[high], above[high]
+        if jet is not None:
+            removal = np.minimum(removal, jet.distance(points @ self.vessel.turn.T).astype(np.float32) / grid.voxel - 1)
+        for view, shadow in zip(self.views, shadows):
+            explained = signed_distance_2d(view.heights <= level) * np.float32(view.stride)
+            fixed = (
+                points,
+                np.ascontiguousarray(view.camera.projection),
+                focal_length(view.camera) * grid.voxel,
+                explained,
+                view.corner,
+                view.stride,
+                np.zeros((0, 0), np.float32) if shadow is None else shadow,
+                grid.voxel,
+            )
+            over_range(_phantom_depth, len(points), *fixed, removal, smallest=_SMALL_LOOP)
+        flat[doubtful] = np.maximum(flat[doubtful], removal)
+        below = room.nodes[: np.searchsorted(room.heights, level + _NEAR * grid.voxel)]
+        pool = np.maximum((room.heights[: len(below)] - level) / grid.voxel, room.distance[: len(below)])
+        flat[below] = np.minimum(flat[below], pool.astype(np.float32))
+        return settled
+
+
+@dataclass(frozen=True)
+class _Room:
+    """The nodes of `grid` in and about a vessel, by height: flat node numbers, heights (scene units), and distances to
+    the wall (voxels, negative inside)."""
+
+    grid: Grid
+    nodes: np.ndarray
+    heights: np.ndarray
+    distance: np.ndarray
+
+    @classmethod
+    def of(cls, vessel: Vessel, grid: Grid) -> _Room:
+        chosen, heights, distances = [], [], []
+        ny, nz = grid.shape[1:]
+        plane = np.stack(np.meshgrid(np.arange(ny), np.arange(nz), indexing="ij"), axis=-1).reshape(-1, 2)
+        for i in range(grid.shape[0]):  # a plane at a time: the whole grid's coordinates are too much to hold
+            points = grid.to_scene(np.column_stack([np.full(len(plane), i), plane]))
+            distance = vessel.room(points) / np.float32(grid.voxel)
+            near = np.nonzero(distance < _NEAR)[0]
+            chosen.append(i * ny * nz + near)
+            heights.append(vessel.height(points[near]))
+            distances.append(distance[near])
+        height = np.concatenate(heights)
+        order = np.argsort(height, kind="stable")
+        return cls(grid, np.concatenate(chosen)[order], height[order], np.concatenate(distances)[order])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _phantom_depth(
+    points: np.ndarray,
+    projection: np.ndarray,
+    pixels_per_voxel: float,
+    explained: np.ndarray,
+    corner: np.ndarray,
+    stride: int,
+    shadow: np.ndarray,
+    tolerance: float,
+    phantom: np.ndarray,
+    start: int,
+    stop: int,
+) -> None:
+    """phantom = min(phantom, depth within what this view explains by the pool), voxels, where it sees the point."""
+    height, width = explained.shape
+    for n in range(start, stop):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+        if depth <= 0:
+            continue
+        u = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
+        v = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
+        within = shadow.shape[0] > 0 and 0 <= u < shadow.shape[1] and 0 <= v < shadow.shape[0]
+        if within and depth > shadow[int(v), int(u)] + tolerance:
+            continue
+        a = min(max((u - 0.5 - corner[0]) / stride, 0.0), width - 1.0)
+        b = min(max((v - 0.5 - corner[1]) / stride, 0.0), height - 1.0)
+        column, row = min(int(a), width - 2), min(int(b), height - 2)
+        a -= column
+        b -= row
+        pixels = (explained[row, column] * (1 - a) + explained[row, column + 1] * a) * (1 - b) + (
+            explained[row + 1, column] * (1 - a) + explained[row + 1, column + 1] * a
+        ) * b
+        phantom[n] = min(phantom[n], -pixels * depth / pixels_per_voxel)

@@ -1,0 +1,110 @@
+"""A first look at the whole sequence, before any frame is reconstructed: where the jet is, and how high the pool.
+
+Both follow from gravity, the container and the masks of all frames; see ballistic.py and pool.py. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splashbench.observe.grid import Bounds, Grid
+from splashbench.observe.occlusion import ContainerShadow
+from splashbench.observe.signed_distance import signed_distance_frames
+from splashbench.observe.silhouettes import Silhouettes
+
+from ..flip.solver import STANDARD_GRAVITY
+from ..motion.ballistic import Jet, Slices, fit_jets, framed, open_floor, slices_of
+from .pool import Pool, Vessel, upright
+
+_CELLS = 96
+# What is within so many voxels above a container's rim may rest on it.
+_RIM_MARGIN = 4
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is known of the liquid before it is reconstructed.
+
+    turn: [3, 3] scene axes to upright ones. jets: per frame, or None. floor: height above which the jets were found,
+    scene units. pool, levels: the pool and its height per frame (NaN: none), or None and all NaN. shadows: per view
+    the container's depth image, None where it hides nothing.
+    """
+
+    turn: np.ndarray
+    jets: list[Jet | None]
+    floor: float
+    pool: Pool | None
+    levels: np.ndarray
+    shadows: list[np.ndarray | None]
+
+    def refined(self, phi: np.ndarray, grid: Grid, t: int) -> np.ndarray:
+        """The hull's distance `phi` of frame `t` on `grid` (voxels), with a full pool and without what floats on it."""
+        if self.pool is None or not np.isfinite(self.levels[t]):
+            return phi
+        return self.pool.lowered(phi, grid, float(self.levels[t]), self.shadows, self.jets[t])
+
+    def jet_floor(self, t: int) -> float:
+        """Height down to which the jet of frame `t` flies freely: the pool's level, or where the jets were found."""
+        level = float(self.levels[t])
+        return level if np.isfinite(level) else self.floor
+
+    def landed(self, grid: Grid, t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Where carriers that fly from `start` to `end` [N, 3] (nodes of `grid`) until frame `t` come to rest.
+
+        A fall ends where it meets the pool or the container's wall.
+        """
+        vessel = None if self.pool is None else self.pool.vessel
+        level = float(self.levels[t])
+        if vessel is None:
+            return end
+        stays = np.ones(len(start), dtype=np.float32)
+        from_height, to_height = vessel.height(grid.to_scene(start)), vessel.height(grid.to_scene(end))
+        falls = (from_height > level) & (to_height < level)  # neither where the level is not known (NaN)
+        stays[falls] = (from_height[falls] - level) / (from_height[falls] - to_height[falls])
+        way = np.linalg.norm(end - start, axis=1)
+        far = np.nonzero(way > 1)[0]  # a voxel at a time: no wall is thinner
+        for step in range(1, int(np.ceil(way.max(initial=0))) + 1):
+            far = far[(step - 1) / way[far] < stays[far]]
+            share = np.minimum(step / way[far], stays[far]).astype(np.float32)
+            points = start[far] + share[:, None] * (end[far] - start[far])
+            walled = far[vessel.walled(grid.to_scene(points))]
+            stays[walled] = (step - 1) / way[walled]
+        return (start + stays[:, None] * (end - start)).astype(np.float32)
+
+
+def survey(
+    silhouettes: Silhouettes,
+    bounds: Bounds,
+    container: ContainerShadow | None,
+    gravity: np.ndarray,
+    metres_per_unit: float | None,
+    times: np.ndarray,
+    shadows: list[np.ndarray | None],
+    find_pool: bool = True,
+    find_jets: bool = True,
+) -> Survey:
+    """Look at all frames on a coarse grid over `bounds`.
+
+    gravity: unit vector [3]. metres_per_unit: None where the scale or the frames' times are not known; then no jet is
+    looked for, as the speed of a fall is not known either. shadows: per view the container's depth image, or None.
+    """
+    turn = upright(gravity)
+    vessel = None if container is None else Vessel.of(container.mesh, gravity)
+    pool = None if vessel is None or container is None or not find_pool else Pool(vessel, silhouettes, container.hides)
+    levels = np.full(silhouettes.n_frames, np.nan) if pool is None else pool.levels()
+    jets: list[Jet | None] = [None] * silhouettes.n_frames
+    floor = -np.inf
+    if find_jets and metres_per_unit is not None:
+        grid = Grid.over(bounds, _CELLS)
+        upright_nodes = grid.nodes().reshape(-1, 3) @ turn.T
+        frames: list[Slices] = []
+        for phi in signed_distance_frames(silhouettes, grid, "silhouette", container):
+            filled = np.clip(0.5 - phi.reshape(-1), 0, 1)
+            inside = filled > 0
+            frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))
+        floor = open_floor(frames, grid.voxel) if vessel is None else vessel.rim + _RIM_MARGIN * grid.voxel
+        airborne = [framed(frame.above(floor), silhouettes.cameras, turn) for frame in frames]
+        jets = fit_jets(airborne, times, STANDARD_GRAVITY / metres_per_unit, grid.voxel)
+    return Survey(turn, jets, floor, pool, levels, shadows)

@@ -1,0 +1,219 @@
+"""Settings of SplashSplat and its presets.
+
+"paper" is the supplement's "Implementation Details"; "best" departs from it where that was measured to help; "quick"
+is for a first look within minutes. The paper's ablations are `variant` and, with two children, `separation_weight=0`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from splashbench.harness.contract import MethodConfig
+from splashbench.observe.signed_distance import DistanceMethod
+
+from .appearance.decoder import DecoderSettings
+from .appearance.fitting import FitSettings
+from .appearance.losses import LossWeights
+from .carriers.resampling import ShellSettings
+from .carriers.tracking import CarrierSettings, Variant
+from .motion.velocity import VelocitySettings
+
+if TYPE_CHECKING:
+    from ..scaffold_gs import BackgroundSettings
+
+
+#: Of the method; raised when a change alters figures, so that no study takes over runs from before.
+VERSION = "3"
+
+
+class SplashSplatConfig(MethodConfig):
+    """Settings of SplashSplat. Lengths are in transport voxels; *_cells counts cells along the longest side."""
+
+    # Observation fields
+    hull_cells: int = Field(224, ge=16, le=512)
+    transport_cells: int = Field(112, ge=16, le=256)
+    control_cells: int = Field(28, ge=4, le=128)
+    distance: DistanceMethod = "silhouette"
+    #: use the container's mesh, where the scene has one: what it hides, and where its walls are
+    container: bool = True
+    #: tell masks with much missing, beside empty ones
+    detect_failures: bool = True
+    #: carve, and compare photographs, at each camera's own times, where the scene has them
+    camera_times: bool = True
+    #: level the liquid that rests in the container (needs the mesh and gravity)
+    pool: bool = True
+    # Velocity
+    #: free fall for the jet (needs gravity, the metric scale and the frames' times)
+    ballistic: bool = True
+    #: no motion where the level set's leads farther away from the observations than none
+    gate_motion: bool = True
+    velocity_steps: int = Field(35, ge=0)
+    velocity_step_size: PositiveFloat = 0.45
+    velocity_band: PositiveFloat = 4.0
+    velocity_smoothing: float = Field(0.6, ge=0)
+    velocity_smooth: Literal["update", "field"] = "update"
+    projection_blend: float = Field(0.35, ge=0, le=1)
+    velocity_limit: PositiveFloat = 8.0
+    # Carriers
+    variant: Variant = "full"
+    correction: PositiveFloat = 1.0
+    kill_outside: PositiveFloat = 0.5
+    kill_inside: float | None = Field(-3.0, lt=0)
+    cell_capacity: PositiveInt | None = 8
+    #: frames that a carrier lasts on average; None for as long as it stays in the liquid
+    lifetime: PositiveInt | None = 2
+    shell_depth: PositiveFloat = 1.5
+    #: how far beyond the surface carriers are born, too: coarse grids miss what is thinner than a voxel
+    shell_outside: float = Field(0, ge=0, le=0.5)
+    min_per_cell: PositiveInt = 2
+    max_per_cell: PositiveInt = 6
+    #: no carriers where no training view can see them
+    visible_only: bool = True
+    # Decoder
+    feature_size: PositiveInt = 32
+    #: Gaussians of a carrier
+    children: int = Field(1, ge=1, le=6)
+    base_scale: PositiveFloat = 0.35
+    # Optimisation
+    iterations: int = Field(4000, ge=0)
+    learning_rate_features: PositiveFloat = 0.06
+    learning_rate_shared: PositiveFloat = 0.02
+    learning_rate_heads: PositiveFloat = 0.015
+    learning_rate_scales: PositiveFloat = 1e-2
+    #: carriers born in one cell share a part of their features: its size in voxels and in frames, for each part
+    shared_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
+    anneal: bool = True
+    #: of the photographs, withheld to tell when to stop before `iterations`; 0 never stops before
+    withheld_share: float = Field(0.04, ge=0, le=0.1)
+    stop_gain: float = Field(0.01, ge=0, lt=1)
+    ssim_every: PositiveInt = 1
+    silhouette_norm: Literal["image", "mask"] = "image"
+    foreground_weight: float = Field(0.5, ge=0)
+    gradient_weight: float = Field(0.1, ge=0)
+    ssim_weight: float = Field(0.2, ge=0)
+    silhouette_weight: float = Field(0.7, ge=0)
+    covariance_weight: float = Field(0.01, ge=0)
+    separation_weight: float = Field(0.1, ge=0)
+    colour_weight: float = Field(1.0, ge=0)
+    #: carriers whose learned opacity ends below this are dropped; 0 keeps all
+    prune_opacity: float = Field(0.01, ge=0, lt=1)
+    # Background, fitted by scaffold_gs: its preset
+    background_preset: Literal["best", "paper", "quick"] = "best"
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "best": {},
+        "paper": {
+            "hull_cells": 176,
+            "transport_cells": 96,
+            "control_cells": 24,
+            "distance": "carve",
+            "container": False,
+            "detect_failures": False,
+            "camera_times": False,
+            "pool": False,
+            "ballistic": False,
+            "gate_motion": False,
+            "visible_only": False,
+            "velocity_smooth": "field",
+            "kill_inside": None,
+            "cell_capacity": None,
+            "lifetime": None,
+            "shell_depth": 3.0,
+            "max_per_cell": 5,
+            "children": 2,
+            "base_scale": 0.7,
+            "iterations": 3000,
+            "learning_rate_features": 2e-3,
+            "learning_rate_heads": 2e-3,
+            "learning_rate_scales": 2e-3,
+            "shared_cells": (),
+            "anneal": False,
+            "withheld_share": 0.0,
+            "prune_opacity": 0.0,
+            "background_preset": "paper",
+        },
+        "quick": {
+            "hull_cells": 160,
+            "transport_cells": 80,
+            "control_cells": 20,
+            "cell_capacity": 6,
+            "min_per_cell": 3,
+            "max_per_cell": 4,
+            "shell_outside": 0.125,
+            "iterations": 800,
+            "ssim_every": 2,
+            "background_preset": "quick",
+        },
+    }
+
+    @property
+    def control_factor(self) -> int:
+        """Transport voxels per control cell."""
+        return max(1, round(self.transport_cells / self.control_cells))
+
+    @property
+    def background(self) -> BackgroundSettings:
+        from ..scaffold_gs import BackgroundSettings
+
+        return BackgroundSettings.model_validate(BackgroundSettings.presets[self.background_preset])
+
+    @property
+    def velocity(self) -> VelocitySettings:
+        return VelocitySettings(
+            steps=self.velocity_steps,
+            step_size=self.velocity_step_size,
+            band=self.velocity_band,
+            smoothing=self.velocity_smoothing,
+            smooth=self.velocity_smooth,
+            projection_blend=self.projection_blend,
+            limit=self.velocity_limit,
+        )
+
+    @property
+    def carriers(self) -> CarrierSettings:
+        return CarrierSettings(
+            variant=self.variant,
+            correction=self.correction,
+            kill_outside=self.kill_outside,
+            kill_inside=self.kill_inside,
+            cell_capacity=self.cell_capacity,
+            lifetime=self.lifetime,
+            shell=ShellSettings(
+                depth=self.shell_depth,
+                outside=self.shell_outside,
+                min_per_cell=self.min_per_cell,
+                max_per_cell=max(self.min_per_cell, self.max_per_cell),
+            ),
+        )
+
+    @property
+    def decoder(self) -> DecoderSettings:
+        return DecoderSettings(feature_size=self.feature_size, children=self.children)
+
+    @property
+    def optimisation(self) -> FitSettings:
+        return FitSettings(
+            iterations=self.iterations,
+            learning_rate_features=self.learning_rate_features,
+            learning_rate_shared=self.learning_rate_shared,
+            shared_cells=self.shared_cells,
+            learning_rate_heads=self.learning_rate_heads,
+            learning_rate_scales=self.learning_rate_scales,
+            anneal=self.anneal,
+            withheld_share=self.withheld_share,
+            stop_gain=self.stop_gain,
+            ssim_every=self.ssim_every,
+            base_scale=self.base_scale,
+            weights=LossWeights(
+                foreground=self.foreground_weight,
+                gradient=self.gradient_weight,
+                ssim=self.ssim_weight,
+                silhouette=self.silhouette_weight,
+                covariance=self.covariance_weight,
+                separation=self.separation_weight,
+                colour=self.colour_weight,
+            ),
+        )

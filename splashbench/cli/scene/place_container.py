@@ -1,0 +1,138 @@
+"""`splashbench scene place`: say in a scene's scene.json where its scanned container stands."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splashbench.cli.output import add_json, emit, say
+
+if TYPE_CHECKING:
+    from splashbench.container.released_scene import ReleasedPlacement
+    from splashbench.scene.layout import SceneMeta
+
+# Beyond these, what scene.json said and what the container says of gravity and scale are told apart.
+_TILT_DEGREES, _SCALE = 3.0, 1.05
+
+_EPILOG = """\
+examples:
+  splashbench scene place data/real_scene/bowl_001 data/meshes/bowl_001.glb --picture bowl_001.png
+  splashbench scene place data/real_scene_crop/bowl_001 data/meshes/bowl_001.glb --masks data/real_scene/bowl_001
+
+The masks in container_mask/ of the training cameras place the mesh, those of the test cameras verify it. MESH is copied
+into the scene, and scene.json says where it stands, what is down (a container stands upright; its mesh has to be level
+in its own coordinates) and how long a scene unit is (a scan is in metres), unless it said so before. splashsplat uses
+all three. The scene is another one for the scorer then: run methods again.
+"""
+
+
+def register(actions: argparse._SubParsersAction) -> None:
+    """Add the action to those of `splashbench scene`."""
+    action = actions.add_parser(
+        "place",
+        help="find where its scanned container stands, for scene.json",
+        description="Place the mesh of the container in SCENE by its container masks, and write that to scene.json.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    action.add_argument("scene", type=Path, help="folder of the scene")
+    action.add_argument("mesh", type=Path, help="the container's mesh: .glb, .ply or .obj")
+    action.add_argument(
+        "--masks", type=Path, metavar="SCENE", help="the scene before it was cropped, which has the container masks"
+    )
+    action.add_argument(
+        "--up",
+        choices=("x", "-x", "y", "-y", "z", "-z"),
+        help="the mesh's direction that points up (default: what fits; y where several do)",
+    )
+    action.add_argument(
+        "--metres-per-unit", type=_positive, default=1.0, metavar="M", help="length of the mesh's unit (default 1)"
+    )
+    action.add_argument(
+        "--transparent",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="whether the liquid is seen through the container's walls (default: as scene.json says; else not)",
+    )
+    action.add_argument("--picture", type=Path, metavar="PNG", help="draw the placed outline over every camera's image")
+    action.add_argument("--replace", action="store_true", help="replace container, gravity and scale in scene.json")
+    add_json(action)
+    action.set_defaults(handler=place)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no length")
+    return value
+
+
+def place(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench scene place`."""
+    from splashbench.container.entry import doubtful, picture, require_picture
+    from splashbench.container.released_scene import place_in_scene, require_container_place, write_placement
+    from splashbench.files import write_png
+    from splashbench.scene import Scene
+    from splashbench.scene.container import read_mesh
+
+    scene = Scene.open(arguments.scene)
+    require_container_place(scene, arguments.mesh, arguments.replace)
+    require_picture(arguments.picture)
+    mesh = read_mesh(arguments.mesh)
+    masked = None if arguments.masks is None else Scene.open(arguments.masks)
+    say("placing the mesh by its masks")
+    found = place_in_scene(scene, mesh, masked, arguments.up, arguments.metres_per_unit)
+    drawn = None if arguments.picture is None else picture(scene, mesh, found.placement.pose)
+    meta = write_placement(scene, arguments.mesh, found, arguments.transparent, arguments.replace)
+    if drawn is not None:
+        write_png(arguments.picture, drawn)
+    placement = found.placement
+    doubted = doubtful(found.projections)
+    if arguments.json:
+        emit(
+            {
+                "scene": str(scene.directory),
+                "pose": placement.pose.tolist(),
+                "gravity": meta.gravity,
+                "metres_per_unit": meta.metres_per_unit,
+                "found_gravity": found.gravity,
+                "found_metres_per_unit": found.metres_per_unit,
+                "up_axis": placement.up_axis,
+                "up_is_ambiguous": placement.up_is_ambiguous,
+                "turn": placement.turn,
+                "overlap": {name: projection.iou for name, projection in found.projections.items()},
+                "doubtful": doubted,
+            }
+        )
+    for name, projection in found.projections.items():
+        distance = projection.contour_median_px
+        off = "" if distance is None else f", outlines {distance:.2f} px apart"
+        held_out = "" if name in scene.train else " (held out)"
+        say(f"camera {name}{held_out}: mesh and mask overlap {projection.iou:.3f}{off}")
+    _say_what_is_doubtful(found, doubted, meta)
+    say(f"wrote {scene.directory / 'scene.json'}: a scene unit is {meta.metres_per_unit:.4g} m; run methods again")
+    return 0
+
+
+def _say_what_is_doubtful(found: ReleasedPlacement, doubted: list[str], meta: SceneMeta) -> None:
+    placement = found.placement
+    if doubted:
+        say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")
+    if placement.up_is_ambiguous:
+        say(f"note: the mesh fits with other directions up as well; {placement.up_axis} was taken, see --up")
+    if placement.turn != "determined":
+        looks = "however it is turned" if placement.turn == "free" else f"at {placement.equivalent_turns} turns"
+        say(f"note: the container looks the same {looks}; one was taken")
+    angle = math.degrees(math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(meta.gravity or (), found.gravity))))))
+    if angle > _TILT_DEGREES:
+        say(f"note: scene.json's gravity stays, {angle:.0f} degrees from the container's; --replace replaces it")
+    if not 1 / _SCALE < (meta.metres_per_unit or 0) / found.metres_per_unit < _SCALE:
+        say(
+            f"note: scene.json's metres_per_unit stays, {meta.metres_per_unit:.4g}; by the mesh it is"
+            f" {found.metres_per_unit:.4g}, see --metres-per-unit; --replace replaces it"
+        )

@@ -1,0 +1,88 @@
+"""`splashbench scene container`: reconstruct a container that nobody scanned from the scene's own footage."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splashbench.cli.output import add_json, emit, say
+
+_EPILOG = """\
+examples:
+  splashbench scene container data/real_scene/bowl_001 --picture bowl_001.png
+  splashbench scene container data/real_scene_crop/bowl_001 --masks data/real_scene/bowl_001
+
+For an opaque container without a scan (with one: `splashbench scene place`). How deep its surface lies in the training
+views is found by plane sweep on what stands still, within container_mask/ of the training cameras; the masks of the
+test cameras verify it. It needs texture, and views that overlap. splashsplat then knows what the container hides.
+Gravity and metric scale stay as they are. The scene is another one for the scorer then: run methods again.
+"""
+
+
+def register(actions: argparse._SubParsersAction) -> None:
+    """Add the action to those of `splashbench scene`."""
+    action = actions.add_parser(
+        "container",
+        help="reconstruct its container from the footage, where there is no scan",
+        description="Reconstruct the opaque container in SCENE from its training views, and name it in scene.json.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    action.add_argument("scene", type=Path, help="folder of the scene")
+    action.add_argument(
+        "--masks", type=Path, metavar="SCENE", help="the scene before it was cropped, which has the container masks"
+    )
+    action.add_argument(
+        "--picture",
+        type=Path,
+        metavar="PNG",
+        help="draw every camera's image with its outline, its surface beside",
+    )
+    action.add_argument("--replace", action="store_true", help="replace the container that scene.json names")
+    add_json(action)
+    action.set_defaults(handler=reconstruct)
+
+
+def reconstruct(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench scene container`."""
+    from splashbench.container.entry import doubtful, require_picture, require_place
+    from splashbench.container.reconstruction import container_from_footage, picture, write_reconstruction
+    from splashbench.errors import SplashbenchError
+    from splashbench.files import write_png
+    from splashbench.scene import Scene
+
+    scene = Scene.open(arguments.scene)
+    if scene.container_transparent:
+        raise SplashbenchError(
+            f"{scene.directory / 'scene.json'}: the container is transparent; it hides nothing, and its depth cannot be"
+            " seen; place a scan (`splashbench scene place`)"
+        )
+    require_place(scene, arguments.replace)
+    require_picture(arguments.picture)
+    masked = None if arguments.masks is None else Scene.open(arguments.masks)
+    say(f"reconstructing the container from {len(scene.train)} training views")
+    found = container_from_footage(scene, masked)
+    drawn = None if arguments.picture is None else picture(scene, found)
+    path = write_reconstruction(scene, found, arguments.replace)
+    if drawn is not None:
+        write_png(arguments.picture, drawn)
+    doubted = doubtful(found.projections)
+    if arguments.json:
+        emit(
+            {
+                "scene": str(scene.directory),
+                "mesh": str(path),
+                "faces": len(found.mesh.faces),
+                "overlap": {name: projection.iou for name, projection in found.projections.items()},
+                "doubtful": doubted,
+            }
+        )
+    for name, projection in found.projections.items():
+        held_out = "" if name in scene.train else " (held out)"
+        say(f"camera {name}{held_out}: surface and mask overlap {projection.iou:.3f}")
+    if doubted:
+        say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")
+    if scene.container_transparent is None:
+        say("note: it was taken to be opaque; a container that is seen through needs a scan")
+    say(f"wrote {path}, {len(found.mesh.faces)} triangles, and scene.json; run methods again")
+    return 0

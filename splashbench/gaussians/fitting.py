@@ -1,0 +1,114 @@
+"""Fits a dynamic model to the training photographs by gradient descent.
+
+Loss .8 L1 + .2 (1 - SSIM) on whole images (Kerbl et al. 2023, Eq. 7), the mean over the views of a step, and what
+the model penalises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splashbench.errors import SplashbenchError
+from splashbench.gaussians.losses import l1
+from splashbench.gaussians.optimizer import RowOptimizer
+from splashbench.gaussians.photographs import Photographs
+from splashbench.gaussians.splats import DynamicModel, Splats
+from splashbench.gaussians.ssim import SsimTarget, ssim
+from splashbench.scene import Camera
+
+_SSIM_WEIGHT = 0.2
+
+
+class Density(Protocol):
+    """How primitives come and go: density.py, or a method's own."""
+
+    def wants_gradients(self, step: int) -> bool:
+        """Whether `observe` is to be called at `step`."""
+        ...
+
+    def observe(self, camera: Camera, splats: Splats, gradients: Tensor) -> None:
+        """Take note of a view; gradients: of its loss by the means [N, 3]."""
+        ...
+
+    def after_step(self, step: int) -> None:
+        """What is due after step number `step`, counted from 0."""
+        ...
+
+
+@dataclass(frozen=True)
+class History:
+    """How the fit went: PSNR [steps] in dB of the training photographs, whole images, each as it was rendered."""
+
+    psnr: NDArray[np.float32]
+
+    def gained_in_last_quarter(self) -> float:
+        """What the last quarter of the steps gained, dB: the mean of its second half, over the eighth before it."""
+        steps = len(self.psnr)
+        eighth = max(1, steps // 8)
+        return float(self.psnr[steps - eighth :].mean() - self.psnr[steps - 3 * eighth : steps - 2 * eighth].mean())
+
+
+def fit_dynamic(
+    model: DynamicModel,
+    optimizer: RowOptimizer,
+    density: Density,
+    photographs: Photographs,
+    progress: Callable[[float], None],
+    begin_step: Callable[[int], float] = lambda step: 0.0,
+) -> History:
+    """Fit `model` in place, over the optimizer's iterations.
+
+    begin_step: called before every step; what it returns is added to the step's times, such as noise.
+
+    Raises SplashbenchError where the loss stops being finite.
+    """
+    psnr = np.zeros(optimizer.iterations, np.float32)
+    for step in range(optimizer.iterations):
+        shift = begin_step(step)
+        views = photographs.next()
+        total: Tensor | None = None
+        seen: list[tuple[Camera, Splats, Tensor]] = []
+        errors = []
+        states: dict[float, object] = {}
+        for view in views:
+            time = view.time + shift
+            if time not in states:
+                states[time] = model.at(time)
+            splats = model.splats(states[time], view.camera)
+            # A view's own gradient by the means is wanted, not the sum over the views.
+            splats.means = splats.means.clone()
+            splats.means.retain_grad()
+            image = model.view(splats, view.camera, time)
+            loss = (1 - _SSIM_WEIGHT) * l1(image, view.image, np.ones(view.image.shape[:2], bool))
+            truth = view.image * np.float32(1 / 255)
+            loss = loss + _SSIM_WEIGHT * (1 - ssim(image, SsimTarget(truth)))
+            if splats.penalty is not None:
+                loss = loss + splats.penalty
+            total = loss if total is None else total + loss
+            seen.append((view.camera, splats, image))
+            errors.append(float(((image.detach().numpy() - truth) ** 2).mean()))
+        assert total is not None
+        loss = total / len(views)
+        if not math.isfinite(float(loss.detach())):
+            raise SplashbenchError(
+                f"the loss is {float(loss.detach())} at iteration {step + 1}; lower the rates, by rate_factor and what "
+                "other factors of rates the method has"
+            )
+        loss.backward()
+        if density.wants_gradients(step):
+            for camera, splats, _ in seen:
+                if splats.means.grad is not None:
+                    density.observe(camera, splats, splats.means.grad * len(views))
+        optimizer.step()
+        density.after_step(step)
+        psnr[step] = -10 * math.log10(max(float(np.mean(errors)), 1e-10))
+        if step % 10 == 0:
+            progress(step / optimizer.iterations)
+    return History(psnr)

@@ -1,0 +1,218 @@
+"""The child process in which a method runs: `python -m splashbench.harness.child REQUEST`.
+
+This is the harness's code around the method's: it holds the clock, checks every render, and writes what came out.
+Fitting and rendering are two processes, so a model that renders only in the memory that fitted it is found out.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TextIO
+
+from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.files import raise_if_disk_full, read_model, write_model
+from splashbench.harness.contract import Fitted, Method, Run
+from splashbench.harness.discovery import load_method
+from splashbench.harness.external.importers import Importer, load_importer
+from splashbench.harness.messages import DISK_FULL_EXIT, Failure, Outcome, Request
+from splashbench.harness.output_checks import check_geometry, check_particles, checked_render
+from splashbench.processes import end_with_parent
+from splashbench.scene import Camera, Scene, TrainingScene
+from splashbench.submission import Status, to_8bit, write_view
+from splashbench.submission.exr import write_exr
+
+WARM_UP_FRAMES = 10
+
+
+def main(request_path: str) -> int:
+    """Carry out the request; always leaves an Outcome behind unless the process dies."""
+    request = read_model(Path(request_path), Request)
+    end_with_parent(request.harness)
+    phases: dict[str, Callable[[Request, Any, TrainingScene], Outcome]] = {
+        "fit": _fit,
+        "import": _import,
+        "render": _render,
+    }
+    phase = phases[request.phase]
+    try:
+        method: Method | Importer = load_importer(request.importer) if request.importer else load_method(request.method)
+        outcome = phase(request, method, Scene.open(Path(request.scene)).training())
+    except Failure as failure:
+        outcome = Outcome(status=failure.status, reason=failure.reason)
+    except MemoryError as error:
+        outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=f"out of memory {error}".strip())
+    except DiskFullError as error:
+        return _disk_full(error)
+    except Exception as error:
+        if isinstance(error, OSError):
+            try:  # a writer of the method's own
+                raise_if_disk_full(error.filename or request.model, error)
+            except DiskFullError as full:
+                return _disk_full(full)
+        if "out of memory" in str(error).lower():
+            outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=_one_line(error))
+        else:
+            import traceback
+
+            traceback.print_exc()
+            outcome = Outcome(status=Status.CRASHED, reason=_one_line(error))
+    write_model(Path(request.result), outcome)
+    return 0
+
+
+def _disk_full(error: DiskFullError) -> int:
+    """Not the method's failure: the parent reads this last line and tells the user."""
+    print(error, file=sys.stderr)
+    return DISK_FULL_EXIT
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())[:300]
+    return text if isinstance(error, SplashbenchError) else f"{type(error).__name__}: {text}"
+
+
+def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
+    config = method.Config.preset(request.preset, request.overrides)
+    support = method.supports(scene)
+    if not support.ok:
+        raise Failure(Status.UNSUPPORTED, support.reason or "the method gave no reason")
+    with Path(request.progress).open("a", encoding="utf-8") as stream:
+        run = Run(
+            seed=request.seed,
+            device=request.device,
+            directory=Path(request.scratch),
+            budget_seconds=request.budget_seconds,
+            cache=Path(request.cache) if request.cache else None,
+            _report=_reporter(stream),
+        )
+        start = time.perf_counter()
+        fitted = method.fit(scene, config, run)
+        _synchronise()
+        seconds = run.fit_seconds(time.perf_counter() - start)
+    fitted.save(Path(request.model))
+    return Outcome(
+        seconds=seconds,
+        reused=run.reused,
+        stages=run.stages,
+        settings=config.model_dump(mode="json"),
+        peak_device_memory_bytes=_device_peak(),
+        renderer=_renderers(),
+    )
+
+
+def _import(request: Request, importer: Importer, scene: TrainingScene) -> Outcome:
+    fitted = importer.read(Path(request.source), Path(request.export), scene)
+    fitted.save(Path(request.model))
+    return Outcome(peak_device_memory_bytes=_device_peak(), renderer=_renderers())
+
+
+def _reporter(stream: TextIO) -> Callable[[float, str], None]:
+    def report(fraction: float, message: str) -> None:
+        stream.write(f"{fraction:.4f} {' '.join(message.split())}\n")
+        stream.flush()
+
+    return report
+
+
+def _render(request: Request, method: Method | Importer, scene: TrainingScene) -> Outcome:
+    fitted = method.load(Path(request.model), scene)
+    output = Path(request.output)
+    times = request.times or {name: scene.camera_times[name].tolist() for name in scene.test_cameras}
+    views = [(scene.test_cameras[name], t, time) for name, own in times.items() for t, time in enumerate(own)]
+    counts = []
+    with Path(request.progress).open("a", encoding="utf-8") as stream:
+        report = _reporter(stream)
+        for i, (camera, t, time) in enumerate(views):
+            _reset_primitive_counter()
+            where = f"camera {camera.name}, timestep {t}"
+            render = checked_render(fitted.render(camera, time), camera, where)
+            counts.append(_primitive_count())
+            write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
+            if request.exr:
+                write_exr(output / "exr" / camera.name / f"{t:06d}.exr", render.rgb, render.alpha)
+            report((i + 1) / len(views), "rendering the test views")
+    # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
+    particles = fitted.particles() if request.times is None else None
+    if particles is not None:
+        check_particles(particles, scene.n_frames)
+        particles.save(output / "particles.npz")
+    geometry = fitted.signed_distance() if request.times is None else None
+    if geometry is not None:
+        check_geometry(geometry, scene.n_frames)
+        geometry.save(output / "geometry.npz")
+    known = [count for count in counts if count is not None]
+    return Outcome(
+        render_fps=_frame_rate(fitted, scene, request.timing_frames),
+        timed_frames=request.timing_frames,
+        primitives_per_frame=statistics.fmean(known) if known else None,
+        peak_device_memory_bytes=_device_peak(),
+        renderer=_renderers(),
+    )
+
+
+def _time(scene: TrainingScene, camera: Camera, t: int) -> float:
+    """When the photograph that the view is compared with was taken, seconds."""
+    return float(scene.camera_times[camera.name][t])
+
+
+def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | None:
+    """Frames per second: median of at least `frames` synchronised renders after a warm-up, without I/O.
+
+    Protocol v1 (docs/protocol.md, cost).
+    """
+    if frames < 1:
+        return None
+    cameras = list(scene.test_cameras.values())
+    seconds = []
+    for i in range(WARM_UP_FRAMES + frames):
+        camera, t = cameras[i % len(cameras)], (i // len(cameras)) % scene.n_frames
+        _synchronise()
+        start = time.perf_counter()
+        fitted.render(camera, _time(scene, camera, t))
+        _synchronise()
+        if i >= WARM_UP_FRAMES:
+            seconds.append(time.perf_counter() - start)
+    return 1.0 / max(statistics.median(seconds), 1e-9)
+
+
+def _cuda() -> Any:
+    """torch.cuda where the method has loaded torch and uses a device; torch is never imported for this alone."""
+    torch = sys.modules.get("torch")
+    return torch.cuda if torch is not None and torch.cuda.is_available() else None
+
+
+def _synchronise() -> None:
+    cuda = _cuda()
+    if cuda is not None:
+        cuda.synchronize()
+
+
+def _device_peak() -> int | None:
+    cuda = _cuda()
+    return int(cuda.max_memory_allocated()) if cuda is not None else None
+
+
+def _reset_primitive_counter() -> None:
+    counters = sys.modules.get("splashbench.render.counters")
+    if counters is not None:
+        counters.reset()
+
+
+def _primitive_count() -> int | None:
+    """Primitives that the shared renderer drew since the last reset, or None for a renderer of the method's own."""
+    counters = sys.modules.get("splashbench.render.counters")
+    return int(counters.total()) if counters is not None and counters.calls() else None
+
+
+def _renderers() -> list[str]:
+    """The backends of the shared renderer that this process used."""
+    counters = sys.modules.get("splashbench.render.counters")
+    return list(counters.backends()) if counters is not None else []
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

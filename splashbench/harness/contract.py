@@ -1,0 +1,204 @@
+"""The method contract: what a reconstruction method implements, and what it is given.
+
+A method sees training views only; test views reach it as poses and times. It runs in a child process; the harness,
+never the method, measures time, memory, bytes and frame rate, and turns a crash, a NaN, a hang or running out of
+memory into a recorded status. CONTRIBUTING.md shows a complete method in one file.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from splashbench.errors import SplashbenchError
+from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Support:
+    """Whether a method can take a scene, and if not, why (shown to the user)."""
+
+    ok: bool
+    reason: str = ""
+
+
+@dataclass
+class Render:
+    """One view at one instant.
+
+    Attributes:
+        rgb: [H, W, 3] float32, sRGB in [0, 1]: liquid and background together.
+        alpha: [H, W] float32 in [0, 1]: opacity of the liquid alone.
+    """
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+
+
+@dataclass
+class Run:
+    """What the harness hands a method besides the scene.
+
+    Attributes:
+        seed: every random choice follows from it.
+        device: "cpu", or a device the method's framework knows, such as "cuda".
+        directory: scratch space, removed after the run.
+        budget_seconds: the time after which the harness stops the fit, or None. A method may use less.
+        cache: a folder for parts that runs of one study share, see `reuse`; None in ordinary runs.
+        reused: parts that came from there, and the seconds their fit took in an earlier run.
+        stages: seconds of the fit's stages, see `stage`.
+    """
+
+    seed: int = 0
+    device: str = "cpu"
+    directory: Path = Path()
+    budget_seconds: float | None = None
+    cache: Path | None = None
+    reused: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, float] = field(default_factory=dict)
+    _overhead_seconds: float = 0.0
+    _digests: dict[Path, str] = field(default_factory=dict)
+    _report: Callable[[float, str], None] | None = None
+    _checkpoint: Callable[[Fitted], None] | None = None
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        """Tell the user how far the fit is: `fraction` in [0, 1], and what is being done."""
+        if self._report is not None:
+            self._report(float(fraction), message)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the wall time of what is within as the stage `name`, for record.json; stages may come back."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+
+    def checkpoint(self, fitted: Fitted) -> None:
+        """Offer an intermediate state; where the harness collects them it saves it outside the clock."""
+        if self._checkpoint is not None:
+            self._checkpoint(fitted)
+
+    def reuse(
+        self,
+        name: str,
+        scene: TrainingScene,
+        key: Mapping[str, Any],
+        fit: Callable[[], T],
+        save: Callable[[T, Path], None],
+        load: Callable[[Path], T],
+        seeded: bool = True,
+    ) -> T:
+        """What `fit()` gives, or what it gave an earlier run of the same study, scene, key, seed and device.
+
+        For a part of the fit that does not depend on the rest, such as a frozen background `name`. `key` has every
+        setting and version the part depends on, in values that JSON has; `save` writes it into an empty folder and
+        `load` reads it from there, to the same bytes in renders. The harness adds the seconds of the earlier fit.
+        seeded: whether the part depends on the seed; where not, runs of other seeds have it, too. No part may be had
+        within the fit of another: the seconds would be wrong.
+        """
+        if self.cache is None:
+            return fit()
+        from splashbench.harness.reuse import reuse, training_digest
+
+        if scene.directory not in self._digests:
+            start = time.perf_counter()
+            self._digests[scene.directory] = training_digest(scene)
+            self._overhead_seconds += time.perf_counter() - start
+        key = {**key, "seed": self.seed if seeded else None, "device": self.device}
+        part = reuse(self.cache, name, self._digests[scene.directory], key, fit, save, load)
+        self._overhead_seconds += part.overhead_seconds
+        if part.loaded_seconds is not None:
+            self.reused[name] = part.loaded_seconds
+        return part.value
+
+    def fit_seconds(self, wall_seconds: float) -> float:
+        """What a fit of `wall_seconds` would have taken by itself: with the fits of what it reused."""
+        return max(0.0, wall_seconds - self._overhead_seconds) + sum(self.reused.values())
+
+
+class MethodConfig(BaseModel):
+    """Settings of a method. Subclass it with fields and fill `presets`: name -> the fields that differ."""
+
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"best": {}}
+
+    @classmethod
+    def preset(cls, name: str, overrides: Mapping[str, Any] | None = None) -> MethodConfig:
+        """The settings of preset `name`, with `overrides` (values may be text, as typed after `--set`) on top."""
+        if name not in cls.presets:
+            raise SplashbenchError(f"there is no preset {name!r}; choose one of {', '.join(cls.presets)}")
+        values = dict(cls.presets[name]) | dict(overrides or {})
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"])
+            known = ", ".join(sorted(cls.model_fields)) or "none"
+            raise SplashbenchError(f"setting {key}: {first['msg']}; this method's settings: {known}") from None
+
+
+class Fitted(ABC):
+    """A fitted model: renders any camera at any time within the scene's interval."""
+
+    @abstractmethod
+    def render(self, camera: Camera, time: float) -> Render:
+        """The view of `camera` at `time` (seconds, the scene's clock), at the camera's full size.
+
+        Test views are asked for at their camera's own times: near the timesteps, at either end a little outside.
+        """
+
+    @abstractmethod
+    def particles(self) -> Particles | None:
+        """The liquid's particles on the scene's timesteps in scene units, or None for a method without any."""
+
+    def signed_distance(self) -> SignedDistance | None:
+        """The liquid's signed distance on the scene's timesteps, in scene units, or None for a method without one.
+
+        It says where the liquid is, its inside included. Where there is none, that is told from the particles.
+        """
+        return None
+
+    @abstractmethod
+    def save(self, directory: Path) -> None:
+        """Write the model into `directory` (exists, empty). Files under `static/` are what does not change over
+        time, such as a frozen background; everything else counts as dynamic storage. No pickles."""
+
+
+class Method(ABC):
+    """A reconstruction method. Register the class under the entry-point group `splashbench.methods`."""
+
+    id: ClassVar[str]
+    title: ClassVar[str]
+    version: ClassVar[str] = "1"
+    Config: ClassVar[type[MethodConfig]] = MethodConfig
+    #: What `Run.device` may be; a GPU method lists "cuda" too.
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)
+    #: True for the yardsticks that are no reconstructions (methods/controls).
+    control: ClassVar[bool] = False
+    #: True where one set of primitives holds background and liquid, see docs/protocol.md, "mixed methods".
+    mixed: ClassVar[bool] = False
+
+    def supports(self, scene: TrainingScene) -> Support:
+        """Whether this method can take `scene`; a reason where not."""
+        return Support(True)
+
+    @abstractmethod
+    def fit(self, scene: TrainingScene, config: Any, run: Run) -> Fitted:
+        """Fit the scene. `config` is an instance of `Config`."""
+
+    @abstractmethod
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        """Read what `Fitted.save` wrote, in a fresh process. Rendering must equal that of the saved model."""

@@ -1,0 +1,58 @@
+"""The control `oracle`: the ground truth itself as a submission, written by the harness and marked as a control.
+
+No method sees a test image, so this is no method. It must score the perfect value on every image metric; where the
+scene has true particles they are handed in with the liquid they stand for, and score the perfect value against the
+truth; else the particle metrics are null.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from splashbench.errors import SplashbenchError
+from splashbench.files import atomic_directory
+from splashbench.harness import hardware
+from splashbench.progress import track
+from splashbench.scene import Scene, SignedDistance
+from splashbench.submission import IDENTITY, Identity, Record, Submission, seal, write_view
+from splashbench.version import __version__
+
+
+def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
+    """Write the oracle's submission for `scene` into `out`."""
+    with atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene.directory]) as staging:
+        for t in track(range(scene.n_frames), "oracle"):
+            for name in scene.test:
+                mask = np.where(scene.mask(name, t), 255, 0).astype(np.uint8)
+                write_view(staging, name, t, scene.image(name, t), mask)
+        particles = scene.truth_particles()
+        if particles is not None:
+            particles.save(staging / "particles.npz")
+            geometry = _true_geometry(scene)
+            if geometry is not None:
+                geometry.save(staging / "geometry.npz")
+        identity = Identity(
+            method="oracle",
+            preset="truth",
+            scene=scene.name,
+            scene_digest=scene.digest,
+            control=True,
+            splashbench_version=__version__,
+            hardware=hardware.describe(),
+        )
+        carriers = float(particles.active.sum(axis=1).mean()) if particles is not None else None
+        seal(staging, identity, Record(carriers_per_frame=carriers))
+    return Submission.open(out)
+
+
+def _true_geometry(scene: Scene) -> SignedDistance | None:
+    """The true liquid as the protocol defines it; None where the training masks give no hull, hence no grid."""
+    from splashbench.score.protocol import shared_fields
+    from splashbench.score.truth.comparison import true_geometry
+
+    try:
+        return true_geometry(scene, shared_fields(scene)())
+    except SplashbenchError:
+        return None

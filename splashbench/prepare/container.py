@@ -1,0 +1,175 @@
+"""The container of a session: its mesh placed by the training cameras' masks or by clicked points, and verified by all.
+
+Held-out cameras decide nothing about a scene; their masks tell how well the mesh lies where nobody fitted it.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splashbench.container.clicked_points import Click, place_by_points
+from splashbench.container.placement import Placement, place_by_silhouettes, up_from_container
+from splashbench.container.verification import Projection, verify
+from splashbench.errors import SplashbenchError
+from splashbench.prepare.calibration.undistort import Undistorter
+from splashbench.prepare.masks.provider import Mask, read_raw_mask
+from splashbench.prepare.poses.metric import GRAVITY
+from splashbench.prepare.poses.scale import Upright
+from splashbench.prepare.session import DESCRIPTION, Session
+from splashbench.scene.camera import Camera
+from splashbench.scene.container import ContainerMesh
+
+
+@dataclass(frozen=True)
+class PlacedContainer:
+    """The placement, and how each camera that has a mask sees it: training cameras decided, held-out ones did not."""
+
+    placement: Placement
+    projections: dict[str, Projection]
+
+
+def container_masks(folder: Path | None, undistorters: Mapping[str, Undistorter]) -> dict[str, Mask]:
+    """Undistorted, uncropped container masks from FOLDER/<camera>.png in raw geometry; cameras without one are left
+    out."""
+    found: dict[str, Mask] = {}
+    if folder is None:
+        return found
+    for camera, undistorter in undistorters.items():
+        path = folder / f"{camera}.png"
+        if path.is_file():
+            found[camera] = undistorter.mask(read_raw_mask(path, undistorter.lens.width, undistorter.lens.height))
+    return found
+
+
+def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Raise SplashbenchError for a container mask of another size than the recording's (width, height), for clicks
+    outside the frames, and where no training camera has a mask and there are no clicks."""
+    described, folder = session.container, session.container_folder
+    assert described is not None
+    for number, click in enumerate(described.points, 1):
+        for camera, (u, v) in click.pixels.items():
+            width, height = sizes[camera]
+            if not (0 <= u <= width and 0 <= v <= height):
+                raise SplashbenchError(
+                    f"{session.directory / DESCRIPTION}: [container] point {number} lies at ({u:g}, {v:g}) in camera"
+                    f" {camera}, whose frames are {width}x{height}; give pixels of the raw frame"
+                )
+    found = []
+    for camera in session.cameras if folder is not None else ():
+        path = Path(folder or "") / f"{camera}.png"
+        if path.is_file():
+            read_raw_mask(path, *sizes[camera])
+            found.append(camera)
+    if not described.points and not any(camera in session.train for camera in found):
+        raise SplashbenchError(
+            f"{folder}: no mask of a training camera, named <camera>.png; give some, or points under [container]"
+        )
+
+
+def place_container(
+    session: Session,
+    mesh: ContainerMesh,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
+) -> PlacedContainer:
+    """Place the `mesh` of the session's [container]; `cameras` and `masks` [H, W] are undistorted and uncropped.
+
+    Raises SplashbenchError where masks or points do not determine a place.
+    """
+    assert session.container is not None
+    placement = _place(session, mesh, cameras, masks, undistorters, GRAVITY, session.container.scale)
+    return PlacedContainer(placement, verify(mesh, placement.pose, cameras, masks))
+
+
+def _place(
+    session: Session,
+    mesh: ContainerMesh,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
+    gravity: tuple[float, float, float] | None,
+    metres_per_unit: float | None,
+) -> Placement:
+    described = session.container
+    assert described is not None
+    training = [camera for camera in cameras if camera.name in session.train]
+    seen = {camera.name: masks[camera.name] for camera in training if camera.name in masks}
+    placement: Placement | None = None
+    if described.points:
+        placement = place_by_points(
+            mesh,
+            training,
+            [Click(click.point, _pinhole_pixels(click.pixels, undistorters)) for click in described.points],
+            up=described.up or "y",
+            metres_per_unit=metres_per_unit,
+            masks=seen,
+            source=f"{session.directory / DESCRIPTION}: [container] points",
+        )
+    if seen:
+        placement = place_by_silhouettes(
+            mesh,
+            training,
+            seen,
+            up=described.up,
+            metres_per_unit=metres_per_unit,
+            gravity=gravity,
+            initial=None if placement is None else placement.pose,
+            source=str(session.container_folder),
+        )
+    assert placement is not None  # `check_masks` found points or masks
+    return placement
+
+
+def upright_container(
+    session: Session,
+    mesh: ContainerMesh,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
+) -> Upright:
+    """Which way is up, and the metres, from the container in a reconstruction without either: for a session that has
+    neither a flat board nor a marker. `cameras` in structure from motion's own frame."""
+    described = session.container
+    assert described is not None
+    placement = _place(session, mesh, cameras, masks, undistorters, gravity=None, metres_per_unit=None)
+    # Structure from motion's units per unit of the mesh were found; the mesh's own metres are known, or not.
+    known = None if described.scale is None else described.scale / placement.scale
+    return Upright(np.asarray(up_from_container(placement)), placement.pose[:3, 3], known)
+
+
+def _pinhole_pixels(
+    pixels: Mapping[str, tuple[float, float]], undistorters: Mapping[str, Undistorter]
+) -> dict[str, tuple[float, float]]:
+    """Pixels clicked in raw frames, in the undistorted ones."""
+    moved = {}
+    for camera, pixel in pixels.items():
+        lens = undistorters[camera].lens
+        ray = np.append(lens.normalise(np.array([pixel], np.float64))[0], 1.0)
+        u, v, _ = lens.K @ ray
+        moved[camera] = (float(u), float(v))
+    return moved
+
+
+def name_in_scene(mesh: Path) -> str:
+    """What the mesh's file is called in a scene's folder."""
+    return f"container{mesh.suffix.lower()}"
+
+
+def put_into_scene(session: Session, directory: Path) -> None:
+    """Copy the mesh's file into a scene's folder."""
+    path = session.container_mesh
+    assert path is not None
+    shutil.copyfile(path, directory / name_in_scene(path))
+
+
+def container_files(session: Session) -> list[Path]:
+    """The files that a placement is made from."""
+    files = [] if session.container_mesh is None else [session.container_mesh]
+    folder = session.container_folder
+    return [*files, *(sorted(folder.glob("*.png")) if folder is not None else [])]

@@ -1,0 +1,192 @@
+"""The first session.toml of a folder of recordings, written by looking at them; a person then checks it.
+
+What cannot be seen is left to be filled in, with a comment that says what: the size of a printed square, above all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench import toml
+from splashbench.errors import SplashbenchError
+from splashbench.files import write_text
+from splashbench.prepare.init.board_guess import BoardGuess, guess_board
+from splashbench.prepare.init.discovery import Film, Filmed, cameras_of, find_films
+from splashbench.prepare.init.inspection import Look, MarkerFinder, assign, few_frames, look_at
+from splashbench.prepare.session import DESCRIPTION
+from splashbench.prepare.video.recording import Recording
+from splashbench.progress import track
+
+_HELD_OUT_SHARE = 2 / 7  # the paper holds out two of seven cameras
+_BOARD_FRAMES = 12
+_SUBJECTS: tuple[Filmed, ...] = ("pour", "static", "intrinsics")
+
+
+@dataclass(frozen=True)
+class Description:
+    """What was found: the films by subject, the board where one was recognised, and what is left to a person."""
+
+    films: tuple[Film, ...]
+    cameras: tuple[str, ...]
+    board: BoardGuess | None
+    to_do: tuple[str, ...]
+    path: Path
+
+
+def describe(folder: Path, square_metres: float | None = None, replace: bool = False) -> Description:
+    """Write FOLDER/session.toml by looking at the recordings below FOLDER.
+
+    square_metres: side of one square of the printed board, which no picture tells. Raises SplashbenchError where there
+    is a session.toml already (unless `replace`), no film, or a film that cannot be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SplashbenchError(f"{folder} is not a folder; give the folder with the cameras' files")
+    path = folder / DESCRIPTION
+    if path.exists() and not replace:
+        raise SplashbenchError(f"{path} exists already; edit it, or --replace to write it anew")
+    films = _with_subjects(folder, find_films(folder))
+    cameras = cameras_of(film for film in films if film.filmed is not None)
+    if len(cameras) < 2:
+        raise SplashbenchError(
+            f"{folder}: films of {len(cameras)} cameras were told apart; put every camera's files into a folder of its"
+            " name, or its name before theirs (cam1_GX010001.MP4)"
+        )
+    board = guess_board(_board_images(folder, films))
+    text, to_do = _text(folder, films, cameras, board, square_metres)
+    write_text(path, text)
+    return Description(tuple(films), tuple(cameras), board, tuple(to_do), path)
+
+
+def _with_subjects(folder: Path, films: list[Film]) -> list[Film]:
+    """Films with what they show; those whose names do not say are looked at."""
+    unnamed = [film for film in films if film.filmed is None]
+    looks: dict[tuple[str, ...], Look] = {}
+    finder = MarkerFinder()
+    board = next((film for film in films if film.filmed == "intrinsics"), None)
+    if unnamed and board is not None:  # sooner here than by trying every kind of marker on films without any
+        finder.settle(few_frames(Recording([folder / name for name in board.files])))
+    for film in track(unnamed, "looking at films"):
+        looks[film.files] = look_at([folder / name for name in film.files], finder)
+    by_camera: dict[str, list[Film]] = {}
+    for film in films:
+        by_camera.setdefault(film.camera, []).append(film)
+    known = [film for group in by_camera.values() for film in assign(group, looks)]
+    # A second film of the same subject would be listed as more chapters of the first: the longest stands.
+    return _one_of_each(folder, known)
+
+
+def _one_of_each(folder: Path, films: list[Film]) -> list[Film]:
+    chosen: dict[tuple[str, Filmed], Film] = {}
+    left: list[Film] = []
+    for film in films:
+        if film.filmed is None:
+            left.append(film)
+            continue
+        key = (film.camera, film.filmed)
+        if key not in chosen or _bytes(folder, film) > _bytes(folder, chosen[key]):
+            left += [Film(chosen[key].files, film.camera, None)] if key in chosen else []
+            chosen[key] = film
+        else:
+            left.append(Film(film.files, film.camera, None))
+    return [*chosen.values(), *left]
+
+
+def _bytes(folder: Path, film: Film) -> int:
+    return sum((folder / name).stat().st_size for name in film.files)
+
+
+def _board_images(folder: Path, films: Sequence[Film]) -> list[NDArray[np.uint8]]:
+    """Grey frames of the first camera's board clip."""
+    clip = next((film for film in films if film.filmed == "intrinsics"), None)
+    if clip is None:
+        return []
+    recording = Recording([folder / name for name in clip.files])
+    count = len(recording.frame_times)
+    indices = np.unique(np.linspace(0, count - 1, min(count, _BOARD_FRAMES)).astype(int)).tolist()
+    return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for _, image in recording.frames(indices)]
+
+
+def _text(
+    folder: Path, films: Sequence[Film], cameras: Sequence[str], board: BoardGuess | None, square_metres: float | None
+) -> tuple[str, list[str]]:
+    """session.toml, and what a person has to do about it."""
+    held_out = max(1, round(_HELD_OUT_SHARE * len(cameras)))
+    to_do = []
+    name = "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in folder.resolve().name)
+    name = name if name[:1].isalnum() and name.isascii() else "session"
+    blocks = [
+        "# Written by `splashbench prepare --init` from what it saw; check it, and mend what it got wrong.\n"
+        "# The first camera's clock is the scene's. `test` cameras are held out: no reconstruction sees them.\n"
+        + toml.dumps(
+            {
+                "schema_version": 1,
+                "name": name[:100],
+                "cameras": list(cameras),
+                "train": list(cameras[:-held_out]),
+                "test": list(cameras[-held_out:]),
+                "timesteps": 50,
+            }
+        )
+        + "# motion_interval = [2.1, 3.9]   # seconds on the first camera's clock; found by looking unless given\n"
+    ]
+    blocks.append(_board_text(board, square_metres))
+    if board is None:
+        to_do.append("describe the ChArUco board under [board]: none was recognised")
+    elif square_metres is None:
+        to_do.append("measure one printed square and set square_metres and marker_metres under [board]")
+    recordings = {
+        subject: {film.camera: list(film.files) for film in films if film.filmed == subject} for subject in _SUBJECTS
+    }
+    for subject, listed in recordings.items():
+        if listed:
+            blocks.append(toml.dumps({"recordings": {subject: {c: listed[c] for c in cameras if c in listed}}}))
+        missing = [camera for camera in cameras if camera not in listed]
+        if missing:
+            to_do.append(f"no {subject} recording was told for camera {', '.join(missing)}: add [recordings.{subject}]")
+    sweep = [film for film in films if film.filmed == "sweep"]
+    if sweep:
+        blocks.append(toml.dumps({"sweep": {"files": list(sweep[0].files)}}))
+    else:
+        to_do.append("no handheld sweep was found; without one the cameras must share enough of the scene")
+    blocks.append(toml.dumps({"masks": {"provider": "background"}}))
+    unused = [name for film in [*films, *sweep[1:]] if film.filmed is None for name in film.files]
+    if unused:
+        blocks.append("# Not used:\n" + "".join(f"#   {name}\n" for name in unused))
+        to_do.append(f"{len(unused)} films are not used; they are listed at the end of {DESCRIPTION}")
+    return "\n".join(blocks), to_do
+
+
+def _board_text(board: BoardGuess | None, square_metres: float | None) -> str:
+    if board is None:
+        return (
+            "# [board]                       # the ChArUco board that was filmed\n"
+            "# squares_x = 8\n# squares_y = 5\n# square_metres = 0.03\n# marker_metres = 0.0225\n"
+            '# dictionary = "DICT_4X4_50"\n'
+        )
+    text = toml.dumps(
+        {
+            "board": {
+                "squares_x": board.squares_x,
+                "squares_y": board.squares_y,
+                "dictionary": board.dictionary,
+                "legacy": board.legacy,
+                "inverted": board.inverted,
+            }
+        }
+    )
+    if square_metres is None:
+        return text + (
+            "# square_metres =               # measure the side of one printed square, in metres\n"
+            f"# marker_metres =               # and of one marker: about {board.marker_share} of the square's\n"
+        )
+    return text + (
+        f"square_metres = {square_metres}\n"
+        f"marker_metres = {round(square_metres * board.marker_share, 5)}   # seen, to a few percent; measure it\n"
+    )

@@ -1,0 +1,167 @@
+"""What a recording shows, where its name does not say: the board waved about, a scene at rest, liquid, a sweep.
+
+Looked at are a few small frames. A clip in which markers are seen and travel is for the lens; one in which nothing
+changes is the static scene; a camera that itself travels is the sweep; of what is left, the longest is the pour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.prepare.init.discovery import Film, Filmed, with_subject
+from splashbench.prepare.video.recording import Recording
+
+FRAMES = 9
+WIDTH = 640
+# The largest dictionary of each kind holds the smaller ones.
+DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
+_SETTLING_FRAMES = 3
+_MIN_MARKERS = 3  # in an image; fewer are more likely misread than a board
+_CLEAR = 5.0  # markers an image, by which their kind is settled
+_SEEN_SHARE = 0.3  # of the frames looked at, showing markers: the board is what the clip is about
+_TRAVEL = 0.04  # of the image's width, that markers wander in a clip for the lens
+_STILL_GREY = 3.0  # mean change of a pixel over a clip of a scene at rest, in grey levels of 255
+_SWEEP_SHIFT = 0.02  # of the image's width, that the whole picture shifts from one look to the next
+
+
+@dataclass(frozen=True)
+class Look:
+    """Of a few frames of a recording: share that shows markers, how far their middle wanders (image widths), mean
+    change of a pixel between first and others (grey levels), median shift of the whole picture (image widths)."""
+
+    seconds: float
+    marker_share: float
+    marker_travel: float
+    change: float
+    shift: float
+
+
+def few_frames(recording: Recording) -> list[NDArray[np.uint8]]:
+    """A few grey frames [H, W] of a recording, small and spread evenly."""
+    count = len(recording.frame_times)
+    indices = np.unique(np.linspace(0, count - 1, FRAMES).astype(int)).tolist()
+    return [_small(image) for _, image in recording.frames(indices)]
+
+
+def look_at(paths: Sequence[Path], finder: MarkerFinder) -> Look:
+    """Look at a recording. Raises SplashbenchError where it cannot be read."""
+    recording = Recording(paths)
+    images = few_frames(recording)
+    if finder.dictionary is None:
+        finder.settle(images)
+    middles = [middle for middle in (_marker_middle(finder.find(image)) for image in images) if middle is not None]
+    travel = float(np.ptp(np.array(middles), axis=0).max()) / WIDTH if len(middles) > 1 else 0.0
+    first = images[0].astype(np.float32)
+    change = max((float(np.abs(image.astype(np.float32) - first).mean()) for image in images[1:]), default=0.0)
+    shifts = [_shift(a, b) for a, b in pairwise(images)]
+    return Look(
+        seconds=recording.info.duration,
+        marker_share=len(middles) / len(images),
+        marker_travel=travel,
+        change=change,
+        shift=float(np.median(shifts)) if shifts else 0.0,
+    )
+
+
+def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height = max(1, round(grey.shape[0] * WIDTH / grey.shape[1]))
+    return np.asarray(cv2.resize(grey, (WIDTH, height), interpolation=cv2.INTER_AREA))
+
+
+@dataclass(frozen=True)
+class Markers:
+    """Markers in an image: `ids` [N], `corners` [N, 4, 2] pixels."""
+
+    ids: NDArray[np.int64]
+    corners: NDArray[np.float32]
+
+
+@dataclass
+class MarkerFinder:
+    """Finds markers, once it has settled which: a session has one board, so what is settled serves all its films.
+
+    `dictionary`: one of `DICTIONARIES`, None until settled; `inverted`: light on dark.
+    """
+
+    dictionary: str | None = None
+    inverted: bool = False
+
+    def settle(self, images: Sequence[NDArray[np.uint8]]) -> None:
+        """Settle on the kind of marker that is seen most in a few grey images [H, W], if any is seen."""
+        most = 0
+        some = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, _SETTLING_FRAMES).astype(int))]
+        for name in DICTIONARIES:
+            for inverted in (False, True):
+                counts = [len(_detect(image, name, inverted).ids) for image in some]
+                if max(counts) >= _MIN_MARKERS and sum(counts) > most:
+                    most, self.dictionary, self.inverted = sum(counts), name, inverted
+                if most > _CLEAR * len(some):
+                    return
+
+    def find(self, image: NDArray[np.uint8]) -> Markers:
+        """The markers of the settled kind in a grey image [H, W]; none before it is settled."""
+        if self.dictionary is None:
+            return Markers(np.zeros(0, np.int64), np.zeros((0, 4, 2), np.float32))
+        return _detect(image, self.dictionary, self.inverted)
+
+
+def _detect(image: NDArray[np.uint8], dictionary: str, inverted: bool) -> Markers:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)), parameters)
+    corners, ids, _ = detector.detectMarkers(cv2.bitwise_not(image) if inverted else image)
+    return Markers(
+        np.zeros(0, np.int64) if ids is None else np.ravel(ids).astype(np.int64),
+        np.array([np.reshape(found, (4, 2)) for found in corners], np.float32).reshape(-1, 4, 2),
+    )
+
+
+def _marker_middle(markers: Markers) -> NDArray[np.float64] | None:
+    """Mean place of the markers, pixels [2]; None where they are too few to be a board."""
+    if len(markers.ids) < _MIN_MARKERS:
+        return None
+    return np.asarray(markers.corners.reshape(-1, 2).mean(0), np.float64)
+
+
+def _shift(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    """How far the whole picture moved, in image widths, by phase correlation."""
+    window = cv2.createHanningWindow((a.shape[1], a.shape[0]), cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(a.astype(np.float32), b.astype(np.float32), window)
+    return float(np.hypot(x, y)) / a.shape[1]
+
+
+def assign(films: Sequence[Film], looks: dict[tuple[str, ...], Look]) -> list[Film]:
+    """One camera's films with what each shows, as far as it can be told; `looks` by the films' files.
+
+    What names said stays. A subject is given to one film at most.
+    """
+    taken = {film.filmed for film in films if film.filmed}
+    open_films = [film for film in films if film.filmed is None]
+    named = [film for film in films if film.filmed is not None]
+
+    def take(filmed: Filmed, candidates: list[Film]) -> None:
+        if filmed not in taken and candidates:
+            chosen = candidates[0]
+            open_films.remove(chosen)
+            named.append(with_subject(chosen, filmed))
+            taken.add(filmed)
+
+    def look(film: Film) -> Look:
+        return looks[film.files]
+
+    if not named and len(open_films) == 1 and look(open_films[0]).shift > _SWEEP_SHIFT:
+        return [with_subject(open_films[0], "sweep")]
+    waved = [f for f in open_films if look(f).marker_share >= _SEEN_SHARE and look(f).marker_travel > _TRAVEL]
+    take("intrinsics", sorted(waved, key=lambda f: -look(f).marker_share * look(f).marker_travel))
+    still = [f for f in open_films if look(f).change < _STILL_GREY]
+    take("static", sorted(still, key=lambda f: look(f).change))
+    take("pour", sorted(open_films, key=lambda f: -look(f).seconds))
+    return [*named, *open_films]

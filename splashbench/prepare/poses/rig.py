@@ -1,0 +1,207 @@
+"""The calibrated rig of a session: lenses, then poses, then metres (paper Sec. 3, "Capture and calibration")."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.errors import SplashbenchError
+from splashbench.prepare.calibration.board import BoardView, Detector
+from splashbench.prepare.calibration.checkerboard import board_detector, numbered_alike
+from splashbench.prepare.calibration.intrinsics import Calibration, calibrate, focal_guess, frames_to_search
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.calibration.marker import MarkerDetector, is_on_board
+from splashbench.prepare.poses import metric, scale
+from splashbench.prepare.poses import structure_from_motion as poses
+from splashbench.prepare.session import DESCRIPTION, Session
+from splashbench.prepare.video.recording import Recording
+from splashbench.prepare.video.stills import Stills, open_recording
+
+Image = NDArray[np.uint8]
+
+STATIC_FRAMES = 15  # of a static clip, whose median is the picture
+SHARPNESS_WIDTH = 480
+
+
+@dataclass(frozen=True)
+class PosedRig:
+    """Poses in structure from motion's own units, and the prints of known size as the posed images show them."""
+
+    poses: poses.Poses
+    board: tuple[metric.Sighting, ...]
+    marker: tuple[metric.Sighting, ...] = ()
+
+
+class RigRecordings:
+    """The recordings that calibrate a session's cameras, opened once.
+
+    Raises SplashbenchError where session.toml lacks one of them, before anything has been computed.
+    """
+
+    def __init__(self, session: Session) -> None:
+        if session.board is None:
+            raise SplashbenchError(
+                f"{session.directory / DESCRIPTION}: no [board]; describe the calibration board that was filmed"
+            )
+        self.session = session
+        self.detector = board_detector(session.board)
+        if session.marker is not None:
+            MarkerDetector(session.marker)  # is there such a marker?
+            if is_on_board(session.marker, session.board):
+                raise SplashbenchError(
+                    f"{session.directory / DESCRIPTION}: marker {session.marker.id} of [marker] is also on the board;"
+                    " lay another one"
+                )
+        self.boards = {camera: open_recording(session.paths("intrinsics", camera)) for camera in session.cameras}
+        self.static = {camera: open_recording(session.paths("static", camera)) for camera in session.cameras}
+        self.sweep = open_recording(session.sweep_paths) if session.sweep_paths else None
+        self._sharpness: list[float] | None = None  # of all frames of the sweep, once they have been looked at
+
+    def calibrate(self, camera: str) -> Calibration:
+        """One camera's lens from its board clip."""
+        recording = self.boards[camera]
+        indices = frames_to_search(len(recording.frame_times))
+        images = (image for _, image in recording.frames(indices))
+        return calibrate(images, self.detector, str(recording.paths[0]))
+
+    def static_images(self) -> dict[str, Image]:
+        """One picture of the static scene per camera, the median over its clip."""
+        images = {}
+        for camera, recording in self.static.items():
+            count = len(recording.frame_times)
+            indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
+            images[camera] = poses.static_image([frame for _, frame in recording.frames(indices)])
+        return images
+
+    def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> list[Image]:
+        """The `count` sharpest frames of the sweep, spread over it; none where there is no sweep."""
+        if self.sweep is None:
+            return []
+        if self._sharpness is None:
+            self._sharpness = [poses.sharpness_of(luma) for _, luma in self.sweep.luma(SHARPNESS_WIDTH)]
+        chosen = poses.sharpest_per_bin(self._sharpness, count)
+        return [frame for _, frame in self.sweep.frames(chosen)]
+
+    def pose(self, lenses: Mapping[str, Lens], work: Path) -> PosedRig:
+        """Structure from motion of the static scene, and where it shows the board; `work` is an empty folder."""
+        static = self.static_images()
+        found, sweep = solve_poses(static, self.sweep_images, lenses, self.detector, work)
+        return sight_prints(static, sweep, lenses, found, self.session, self.detector)
+
+    def check_sizes(self, lenses: Mapping[str, Lens], others: Mapping[str, Recording]) -> None:
+        """Raise SplashbenchError where a camera recorded at another size than its lens was calibrated at."""
+        checked: list[Mapping[str, Recording | Stills]] = [self.static, dict(others)]
+        for recordings in checked:
+            for camera, recording in recordings.items():
+                lens, info = lenses[camera], recording.info
+                if (info.width, info.height) != (lens.width, lens.height):
+                    raise SplashbenchError(
+                        f"{recording.paths[0]} is {info.width}x{info.height}, the board clip of camera {camera} is"
+                        f" {lens.width}x{lens.height}; film both in the same mode"
+                    )
+
+
+def find_poses(
+    static: Mapping[str, Image],
+    sweep: Sequence[Image],
+    lenses: Mapping[str, Lens],
+    detector: Detector,
+    work: Path,
+) -> poses.Poses:
+    """Structure from motion of the static scene, in its own units; `work` is an empty folder."""
+    return poses.estimate_poses(static, lenses, sweep, work, focal_guess(sweep, detector))
+
+
+def solve_poses(
+    static: Mapping[str, Image],
+    sweep_images: Callable[[int], list[Image]],
+    lenses: Mapping[str, Lens],
+    detector: Detector,
+    work: Path,
+) -> tuple[poses.Poses, list[Image]]:
+    """Structure from motion of the static scene, and the frames of the sweep that it used.
+
+    `sweep_images`: the sweep's sharpest frames by their number (`RigRecordings.sweep_images`). Where they do not bridge
+    the fixed cameras, twice as many are tried, and `Poses.attempts` begins with that. Raises SplashbenchError naming
+    the cameras that could not be posed.
+    """
+    sweep = sweep_images(poses.SWEEP_FRAMES)
+    first, second = work / "first", work / "second"
+    first.mkdir()
+    try:
+        return find_poses(static, sweep, lenses, detector, first), sweep
+    except SplashbenchError as error:
+        more = sweep_images(2 * poses.SWEEP_FRAMES)
+        if len(more) <= len(sweep):
+            raise
+        second.mkdir()
+        found = find_poses(static, more, lenses, detector, second)
+        failed = f"{len(sweep)} frames of the sweep: {error}"
+        return replace(found, attempts=(failed, *found.attempts)), more
+
+
+def sight_prints(
+    static: Mapping[str, Image],
+    sweep: Sequence[Image],
+    lenses: Mapping[str, Lens],
+    found: poses.Poses,
+    session: Session,
+    detector: Detector,
+) -> PosedRig:
+    """The board, and the marker where session.toml describes one, in the static pictures and the posed sweep."""
+    board = _sightings(static, sweep, lenses, found, detector.detect_true)
+    if board:
+        # A checkerboard numbers its corners from either end; for a ChArUco board nothing changes.
+        alike = numbered_alike([s.view for s in board], [s.lens for s in board], [s.w2c for s in board], detector)
+        board = [replace(sighting, view=view) for sighting, view in zip(board, alike)]
+    marker: list[metric.Sighting] = []
+    if session.marker is not None:
+        wanted = MarkerDetector(session.marker)
+        marker = metric.agreeing(_sightings(static, sweep, lenses, found, wanted.detect))
+    return PosedRig(found, tuple(board), tuple(marker))
+
+
+def prints_are_seen(rig: PosedRig, session: Session, detector: Detector) -> bool:
+    """Whether the board or the marker lies where it gives the scene its up."""
+    return session.marker is not None or metric.seen_twice(rig.board) >= metric.Print.of_board(detector).needed
+
+
+def find_frame(
+    rig: PosedRig, session: Session, detector: Detector, container: scale.Upright | None = None
+) -> scale.SceneFrame:
+    """The scene frame from whatever the session has: board, marker, measured distance, container (precedence: see
+    `scale`).
+
+    Raises SplashbenchError where metres or up are missing, where the marker that session.toml describes is not seen,
+    and where a print lies face down.
+    """
+    marker = None
+    if session.marker is not None:
+        marker = metric.align_print(rig.marker, metric.Print.of_marker(MarkerDetector(session.marker)))
+    board = None
+    flat = metric.Print.of_board(detector)
+    # With a marker, or a container, the board may stand or hang anywhere, or be out of sight.
+    if metric.seen_twice(rig.board) >= flat.needed:
+        board = metric.align_print(rig.board, flat, upright=marker is None)
+    distance = None
+    if session.distance is not None:
+        first, second = session.distance.cameras
+        distance = scale.distance_scale(rig.poses, (first, second), session.distance.metres)
+    return scale.choose_frame(board, marker, distance, container)
+
+
+def _sightings(
+    static: Mapping[str, Image],
+    sweep: Sequence[Image],
+    lenses: Mapping[str, Lens],
+    found: poses.Poses,
+    detect: Callable[[Image], BoardView | None],
+) -> list[metric.Sighting]:
+    candidates = [(image, lenses[camera], found.w2c[camera]) for camera, image in static.items()]
+    candidates += [(sweep[index], found.sweep_lens, w2c) for index, w2c in zip(found.sweep_indices, found.sweep_w2c)]
+    views = [(detect(image), lens, w2c) for image, lens, w2c in candidates]
+    return [metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None]

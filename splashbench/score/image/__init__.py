@@ -1,0 +1,1 @@
+"""Image metrics: PSNR, SSIM, LPIPS, silhouettes, jitter (docs/protocol.md)."""

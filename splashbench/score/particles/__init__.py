@@ -1,0 +1,1 @@
+"""Particle metrics: density, uniformity, energy (docs/protocol.md)."""

@@ -1,0 +1,240 @@
+"""Images and exact masks of the room and the liquid, by ray casting through the camera's true lens.
+
+The room does not move, so it is cast once per camera (`View`), with every sample's depth and its colour both in light
+and in the liquid's shadow kept. A frame with liquid (`View.with_liquid`) then costs only the rays that can meet the
+liquid, and the table's and bowl's samples that can lie in its shadow. Image and masks come from the same samples.
+A container of glass (`splashbench.synth.imaging.glass`) hides nothing: it is laid over what lies behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.synth.imaging import shading
+from splashbench.synth.imaging.geometry import Mesh
+from splashbench.synth.imaging.glass import Glass
+from splashbench.synth.imaging.raycast import FAR, Hits, Tracer
+from splashbench.synth.imaging.room import Room
+from splashbench.synth.imaging.texture import sample, to_srgb
+from splashbench.synth.recording.lens import LensCamera
+
+Vectors = NDArray[np.float32]
+
+SAMPLES = 3  # per pixel and axis
+_OFFSET = np.float32(4e-4)  # metres from a surface at which its shadow rays start
+_BEYOND = np.float32(5e-5)  # metres behind one crossing of the liquid's surface at which the next is looked for
+_OPENNESS_RAYS = 16
+_RIM = 32  # pixels beyond the image from which a surface can still reach into it
+_LONGEST_EDGE = 0.006  # metres
+_CROSSINGS = 6  # of the liquid's surface that are followed along a ray through clear liquid
+
+
+@dataclass(frozen=True, eq=False)
+class LiquidFrame:
+    """A rendered instant: `image` float32 [H, W, 3] sRGB in [0, 1]; `mask` bool [H, W], at least half liquid."""
+
+    image: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+
+
+class Stage:
+    """A room ready to be looked at."""
+
+    def __init__(self, room: Room) -> None:
+        self.room = room
+        meshes = [quad.mesh() for quad in room.quads]
+        if room.bowl is not None:
+            meshes.append((room.bowl.vertices, room.bowl.faces))
+        self.bowl_index = len(room.quads) if room.bowl is not None else -2
+        self.tracer = Tracer(meshes)
+        self.glass = Glass(room.glass) if room.glass is not None else None
+
+    def surface(self, points: Vectors, hits: Hits) -> tuple[Vectors, Vectors]:
+        """Albedo and shading normal [R, 3] at hit points."""
+        albedo = np.full((len(points), 3), 0.5, np.float32)
+        normal = hits.normal.copy()
+        for index in np.unique(hits.geometry):
+            chosen = hits.geometry == index
+            if index == self.bowl_index:
+                albedo[chosen], normal[chosen] = self._bowl_surface(hits, chosen)
+            elif index >= 0:
+                quad = self.room.quads[index]
+                offset = points[chosen] - quad.corner.astype(np.float32)
+                u = offset @ (quad.side_u / (quad.side_u @ quad.side_u)).astype(np.float32)
+                v = offset @ (quad.side_v / (quad.side_v @ quad.side_v)).astype(np.float32)
+                albedo[chosen] = sample(quad.texture, u, v)
+        return albedo, normal
+
+    def _bowl_surface(self, hits: Hits, chosen: NDArray[np.bool_]) -> tuple[Vectors, Vectors]:
+        bowl, colors = self.room.bowl, self.room.bowl_albedo
+        assert bowl is not None
+        assert colors is not None
+        corners = bowl.faces[hits.triangle[chosen]]
+        weights = hits.weights[chosen][..., None]
+        normal = (bowl.normals[corners] * weights).sum(axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        away = np.einsum("ij,ij->i", normal, hits.normal[chosen]) < 0
+        normal[away] *= -1
+        return (colors[corners] * weights).sum(axis=1), normal
+
+
+class View:
+    """A stage seen by one camera. Arrays of samples are [P, s * s, ...]: P = H * W pixels, and the samples in each."""
+
+    def __init__(self, stage: Stage, camera: LensCamera, samples: int = SAMPLES) -> None:
+        self.stage, self.camera = stage, camera
+        height, width, s = camera.height, camera.width, samples
+        by_pixel = camera.rays(s).reshape(height, s, width, s, 3).transpose(0, 2, 1, 3, 4)
+        self._directions = np.ascontiguousarray(by_pixel).reshape(height * width, s * s, 3)
+        self._eye = camera.center.astype(np.float32)
+        directions = self._directions.reshape(-1, 3)
+        hits = stage.tracer.nearest(self._eye, directions)
+        hit = hits.geometry >= 0
+        # Beyond the room: a ray that met nothing counts as a far, grey, upright wall.
+        reach = np.where(hit, hits.distance, 10).astype(np.float32)
+        points = np.asarray(self._eye + reach[:, None] * directions, np.float32)
+        albedo, normal = stage.surface(points, hits)
+        lifted = points + _OFFSET * hits.normal
+        light, shade = shading.matte(albedo, normal)
+        light -= shade
+        # The sky changes slowly over a surface: one sample of each pixel speaks for all of them.
+        middle = slice(s * s // 2, None, s * s)
+        shade *= np.repeat(openness(stage.tracer, lifted[middle]), s * s)[:, None]
+        lit = hit & ~stage.tracer.occluded(lifted, np.broadcast_to(shading.TO_LIGHT, points.shape))
+        color = shade + np.where(lit[:, None], light, 0)
+        on_bowl = hits.geometry == stage.bowl_index
+        self._panes = stage.glass.along(self._eye, directions) if stage.glass is not None else None
+        on_container = on_bowl if self._panes is None else self._panes.met
+        self._distance = hits.distance.reshape(-1, s * s)
+        self._lifted, self._color, self._shade = (a.reshape(-1, s * s, 3) for a in (lifted, color, shade))
+        self._lit, self._on_bowl = lit.reshape(-1, s * s), on_bowl.reshape(-1, s * s).any(axis=1)
+        if self._panes is not None:
+            color = self._panes.through(color, 0.0, FAR)
+        self.image = to_srgb(_sample_means(color.reshape(-1, s * s, 3))).reshape(height, width, 3)
+        """The room without liquid: float32 [H, W, 3] sRGB in [0, 1]."""
+        self.container_mask = on_container.reshape(height, width, s * s).mean(axis=2) >= 0.5
+        """Where the container is seen: bool [H, W]."""
+
+    def seen_points(self) -> tuple[Vectors, Vectors]:
+        """What the pixels that meet the room see: points [N, 3] in the world and their sRGB colours [N, 3]."""
+        middle = self._distance.shape[1] // 2
+        met = self._distance[:, middle] < FAR
+        return self._lifted[met, middle], self.image.reshape(-1, 3)[met]
+
+    def with_liquid(self, liquid: Mesh | None) -> LiquidFrame:
+        """The room with this liquid surface in it."""
+        mask = np.zeros(self.image.shape[:2], bool)
+        if liquid is None or not len(liquid.faces):
+            return LiquidFrame(self.image, mask)
+        tracer = Tracer([(liquid.vertices, liquid.faces)])
+        near = self._pixels_near(liquid.vertices)
+        on_table = liquid.vertices - shading.TO_LIGHT * (liquid.vertices[:, 1:2] / shading.TO_LIGHT[1])
+        pixels = np.flatnonzero(near | self._pixels_near(on_table) | self._on_bowl)
+        color = self._color[pixels]
+        distance = np.full(color.shape[:2], FAR, np.float32)
+        lit = self._lit[pixels]
+        darkened = np.zeros_like(lit)
+        darkened[lit] = tracer.occluded(
+            self._lifted[pixels][lit], np.broadcast_to(shading.TO_LIGHT, (int(np.count_nonzero(lit)), 3))
+        )
+        color[darkened] = self._shade[pixels][darkened]
+        seen = np.flatnonzero(near[pixels])
+        distance[seen], color[seen] = self._wetted(liquid, tracer, pixels[seen], color[seen])
+        if self._panes is not None:
+            before = self._panes.of(self._samples_of(pixels)).through(color.reshape(-1, 3), 0.0, distance.ravel())
+            color = before.reshape(color.shape)
+        image = self.image.copy()
+        image.reshape(-1, 3)[pixels] = to_srgb(_sample_means(color))
+        mask.ravel()[pixels] = (distance < FAR).mean(axis=1) >= 0.5
+        return LiquidFrame(image, mask)
+
+    def _wetted(
+        self, liquid: Mesh, tracer: Tracer, pixels: NDArray[np.int_], color: Vectors
+    ) -> tuple[NDArray[np.float32], Vectors]:
+        """How far the liquid is where samples of `pixels` see it before the room (FAR elsewhere), and its colour there.
+
+        Glass before the liquid is left out; where no liquid is seen, `color` stays.
+        """
+        directions = self._directions[pixels]
+        hits = tracer.nearest(self._eye, directions.reshape(-1, 3))
+        first = hits.distance < self._distance[pixels].ravel()
+        view = directions.reshape(-1, 3)[first]
+        points = self._eye + hits.distance[first, None] * view
+        corners, weights = liquid.faces[hits.triangle[first]], hits.weights[first]
+        normal = sum(liquid.normals[corners[:, k]] * weights[:, k : k + 1] for k in range(3))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) + np.float32(1e-9)
+        lifted = points + _OFFSET * hits.normal[first]
+        towards = np.broadcast_to(shading.TO_LIGHT, points.shape)
+        lit = ~(tracer.occluded(lifted, towards) | self.stage.tracer.occluded(lifted, towards))
+        wet = first.reshape(color.shape[:2])
+        in_bowl = self.stage.room.bowl is not None
+        openness = shading.bowl_openness(points) if in_bowl else np.ones(len(points), np.float32)
+        behind = None
+        if self.stage.room.clear_liquid:
+            light = color[wet]
+            if self._panes is not None:
+                panes = self._panes.of(self._samples_of(pixels)[first])
+                light = panes.through(light, hits.distance[first], FAR)
+            reach = self._distance[pixels].ravel()[first] - hits.distance[first]
+            behind = shading.Behind(light, thickness(tracer, points, view, reach))
+        color[wet] = shading.wet(normal, view, lit, openness, behind)
+        return np.where(first, hits.distance, FAR).reshape(wet.shape), color
+
+    def _samples_of(self, pixels: NDArray[np.int_]) -> NDArray[np.int_]:
+        """Indices into all samples, in the order of `pixels`."""
+        per_pixel = self._distance.shape[1]
+        return (pixels[:, None] * per_pixel + np.arange(per_pixel)).ravel()
+
+    def _pixels_near(self, points: Vectors) -> NDArray[np.bool_]:
+        """Which pixels [P] lie within a triangle's reach of any of these surface points."""
+        import cv2
+
+        height, width = self.image.shape[:2]
+        uv, depth = self.camera.project(points.astype(np.float64))
+        at = np.floor(uv).astype(np.int64)
+        inside = (depth > 0) & (at >= -_RIM).all(axis=1) & (at < np.array([width, height]) + _RIM).all(axis=1)
+        marked = np.zeros((height + 2 * _RIM, width + 2 * _RIM), np.uint8)
+        marked[at[inside, 1] + _RIM, at[inside, 0] + _RIM] = 1
+        # No edge of the surface is longer than this in space (marching cubes), so none spans more pixels than that.
+        reach = int(np.ceil(_LONGEST_EDGE * self.camera.K[0, 0] / max(0.2, float(depth.min(initial=1.0))))) + 1
+        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+        grown = cv2.dilate(marked, kernel)
+        return grown[_RIM:-_RIM, _RIM:-_RIM].astype(bool).ravel()
+
+
+def _sample_means(values: Vectors) -> Vectors:
+    """Means over each pixel's samples: [P, S, 3] to [P, 3]."""
+    total = values[:, 0].copy()
+    for k in range(1, values.shape[1]):
+        total += values[:, k]
+    return np.asarray(total / values.shape[1], np.float32)
+
+
+def thickness(tracer: Tracer, points: Vectors, directions: Vectors, reach: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Metres of liquid [R] along rays that enter it at `points` [R, 3] and end `reach` [R] metres later."""
+    total, travelled = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    rays, inside = np.arange(len(points)), True
+    for _ in range(_CROSSINGS):
+        start = travelled[rays] + _BEYOND
+        hits = tracer.nearest(points[rays] + start[:, None] * directions[rays], directions[rays])
+        on = hits.geometry >= 0
+        rays, crossing = rays[on], (start + hits.distance)[on]
+        if inside:
+            total[rays] += np.maximum(np.minimum(crossing, reach[rays]) - travelled[rays], 0)
+        travelled[rays], inside = crossing, not inside
+    return total
+
+
+def openness(tracer: Tracer, points: Vectors) -> NDArray[np.float32]:
+    """Share [R] of the sky that points see, by a fixed fan of upward rays: ambient occlusion, never below 0.4."""
+    seen = np.zeros(len(points), np.float32)
+    for k in range(_OPENNESS_RAYS):
+        azimuth, elevation = 2.4 * k, np.radians(20 + 60 * (k + 0.5) / _OPENNESS_RAYS)
+        direction = np.array(
+            [np.cos(azimuth) * np.cos(elevation), np.sin(elevation), np.sin(azimuth) * np.cos(elevation)], np.float32
+        )
+        seen += ~tracer.occluded(points, np.broadcast_to(direction, points.shape))
+    return (0.4 + 0.6 * seen / _OPENNESS_RAYS).astype(np.float32)

@@ -1,0 +1,1 @@
+"""The simulated liquid: SPH simulation, its surface and its trajectories."""

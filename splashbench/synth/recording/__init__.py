@@ -1,0 +1,1 @@
+"""A synthetic session: what seven cameras and a handheld sweep would have recorded, with exact truth."""

@@ -1,0 +1,57 @@
+"""The SSIM that fits descend on, against scikit-image and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.gaussians.ssim import SsimTarget, ssim
+
+
+def images(height: int = 14, width: int = 17) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    image = rng.random((height, width, 3)).astype(np.float32)
+    return image, np.clip(image + 0.2 * rng.normal(size=image.shape), 0, 1).astype(np.float32)
+
+
+def test_it_equals_scikit_image_inside_the_border():
+    from skimage.metrics import structural_similarity
+
+    a, b = images(40, 50)
+    for image in (a, b):  # the borders' treatment differs; black borders make it moot
+        image[:8], image[-8:], image[:, :8], image[:, -8:] = 0, 0, 0, 0
+    theirs = structural_similarity(
+        a, b, channel_axis=2, data_range=1.0, gaussian_weights=True, use_sample_covariance=False, full=True
+    )[1].mean()
+    assert float(ssim(torch.from_numpy(a), SsimTarget(b))) == pytest.approx(theirs, abs=1e-5)
+    assert float(ssim(torch.from_numpy(a), SsimTarget(a))) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_gradient_is_that_of_finite_differences(masked: bool):
+    image, noisy = images()
+    weight = np.ones(image.shape[:2], np.float32)
+    if masked:
+        weight[3:6, 4:9] = 0
+    target = SsimTarget(torch.from_numpy(image), weight if masked else None)
+    at = torch.from_numpy(noisy).requires_grad_()
+    ssim(at, target).backward()
+    direction = torch.from_numpy(np.random.default_rng(1).normal(size=image.shape).astype(np.float32))
+    plus, minus = (float(ssim(at.detach() + step * direction, target)) for step in (1e-2, -1e-2))
+    assert float((at.grad * direction).sum()) == pytest.approx((plus - minus) / 2e-2, rel=0.02)
+    assert (at.grad[weight == 0] == 0).all()
+
+
+def test_pixels_without_weight_count_as_black_in_both():
+    image, noisy = images()
+    weight = (np.random.default_rng(2).random(image.shape[:2]) < 0.7).astype(np.float32)
+    black = torch.from_numpy(noisy * weight[..., None])
+    expected = float(ssim(black, SsimTarget(image * weight[..., None])))
+    assert float(ssim(torch.from_numpy(noisy), SsimTarget(image, weight))) == pytest.approx(expected, abs=1e-7)
+
+
+def test_images_of_different_sizes_do_not_compare():
+    image, noisy = images()
+    with pytest.raises(ValueError, match="another size"):
+        ssim(torch.from_numpy(noisy[1:]), SsimTarget(image))

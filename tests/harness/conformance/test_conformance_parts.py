@@ -1,0 +1,123 @@
+"""Parts of the conformance test: pickles told from arrays, openings seen, and what a stopped run must not leave."""
+
+import pickle
+import signal
+import subprocess
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splashbench.harness.conformance.opening import Opening
+from splashbench.harness.conformance.scenes import empty_masks, hidden, keep_first_frame
+from splashbench.harness.conformance.stop_checks import signal_faults
+from splashbench.harness.conformance.stopping import Stopped, as_pairs
+from splashbench.harness.conformance.stored import storage_faults
+from splashbench.harness.runner import parse_overrides
+from splashbench.scene import Scene
+
+
+def _torch_like(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", pickle.dumps([1]))
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("model.pkl", lambda path: path.write_bytes(b"anything")),
+        ("model.pt", _torch_like),
+        ("model.bin", _torch_like),
+        ("model.dat", lambda path: path.write_bytes(pickle.dumps({"a": np.zeros(3)}))),
+        ("model.old", lambda path: path.write_bytes(pickle.dumps([1, 2], protocol=2))),
+        ("model.npy", lambda path: np.save(path, np.array([{}], dtype=object))),
+        ("model.npz", lambda path: np.savez(path, good=np.zeros(3), bad=np.array([None]))),
+        ("model.npz", lambda path: np.savez_compressed(path, bad=np.array([None]))),
+    ],
+)
+def test_a_pickle_is_found_under_any_name(tmp_path: Path, name: str, write) -> None:
+    (tmp_path / "static").mkdir()
+    write(tmp_path / "static" / name)
+    (tmp_path / "model.json").write_text("{}")
+    assert storage_faults(tmp_path) == [f"static/{name} is or holds a pickle"]
+
+
+def test_arrays_and_text_are_no_pickles(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", numbers=np.zeros((3, 4)), words=np.array(["a", "b"]), flags=np.ones(2, bool))
+    np.savez_compressed(tmp_path / "b.npz", numbers=np.zeros((3, 4), order="F"))
+    np.save(tmp_path / "c.npy", np.arange(5))
+    (tmp_path / "d.bin").write_bytes(b"\x80\x04" + bytes(50))
+    (tmp_path / "e.zip").write_bytes(b"PK\x03\x04 not an archive")
+    (tmp_path / "f.txt").write_text("text.")
+    (tmp_path / "g.bin").touch()
+    assert storage_faults(tmp_path) == []
+
+
+def test_links_and_nothing_at_all_are_faults(tmp_path: Path) -> None:
+    assert storage_faults(tmp_path) == ["save() wrote no file"]
+    (tmp_path / "model.npz").symlink_to("/etc/hostname")
+    assert storage_faults(tmp_path) == ["model.npz is no plain file"]
+
+
+def test_openings_are_seen_from_any_process(tmp_path: Path) -> None:
+    files = {name: tmp_path / "folder" / name for name in ("read", "native", "unread", "other")}
+    (tmp_path / "folder").mkdir()
+    for path in files.values():
+        path.write_text("text")
+    watched = [files[name] for name in ("read", "native", "unread")]
+    with Opening(watched) as opening:
+        files["read"].read_text()
+        files["other"].read_text()
+        files["unread"].stat()
+        subprocess.run(["cat", str(files["native"])], stdout=subprocess.DEVNULL, check=True)
+    if not opening.complete:
+        pytest.skip("this system has no inotify")
+    assert opening.seen == [files["native"], files["read"]]
+    with Opening(watched) as opening:
+        assert len(list((tmp_path / "folder").iterdir())) == 4
+    assert opening.seen == [tmp_path / "folder"]
+    files["read"].read_text()
+    assert opening.seen == [tmp_path / "folder"]
+
+
+def test_hiding_leaves_a_method_what_it_may_see(balls_copy: Path, balls: Scene, tmp_path: Path) -> None:
+    place = hidden(balls_copy, tmp_path / "place")
+    told = {path.relative_to(balls_copy).as_posix() for path in place.baits}
+    assert "truth/particles.npz" in told
+    assert {f"{kind}/6/000003.png" for kind in ("ims", "seg")} <= told
+    assert not any(name.split("/")[1] in balls.train for name in told)
+    assert all(path.read_bytes().startswith(b"This is a test view") for path in place.baits)
+    view = Scene.open(place.view).training()
+    for name in balls.train:
+        assert (view.image(name, 3) == balls.image(name, 3)).all()
+        assert (view.mask(name, 3) == balls.mask(name, 3)).all()
+
+
+def test_scenes_at_the_edge(balls_copy: Path, balls: Scene) -> None:
+    empty_masks(balls_copy)
+    assert not any(Scene.open(balls_copy).mask(name, t).any() for name in balls.cameras for t in range(balls.n_frames))
+    keep_first_frame(balls_copy)
+    scene = Scene.open(balls_copy)
+    assert scene.n_frames == 1
+    assert scene.times.tolist() == balls.times[:1].tolist()
+    assert (scene.image("6", 0) == balls.image("6", 0)).all()
+
+
+def test_what_a_stopped_run_must_not_leave(tmp_path: Path) -> None:
+    out = tmp_path / "submission"
+    good = Stopped(held=True, exit_code=143, said="interrupted", seconds=0.1)
+    assert signal_faults(good, signal.SIGTERM, out) == []
+    assert signal_faults(good, signal.SIGINT, out) == ["exit status 143: interrupted"]
+    assert signal_faults(Stopped(True, None, "", 20.0), signal.SIGINT, out) == ["the run did not end"]
+    early = Stopped(held=False, exit_code=0, said="ok", seconds=0.1)
+    assert signal_faults(early, signal.SIGTERM, out) == ["the fit did not get to its middle: ok"]
+    (tmp_path / ".tmp-12345678-submission").mkdir()
+    assert signal_faults(good, signal.SIGTERM, out) == [".tmp-12345678-submission was left beside the submission"]
+    out.mkdir()
+    assert "there is a submission" in signal_faults(good, signal.SIGTERM, out)
+
+
+def test_settings_go_through_the_command_line_unchanged() -> None:
+    settings = {"a": {"b": 1, "c": {"d": 0.1}}, "text": "5", "none": None, "list": [1, "x"], "yes": True}
+    assert parse_overrides(as_pairs(settings)) == settings

@@ -1,0 +1,114 @@
+"""Timesteps withheld from a method: what it sees, what is rendered, what is scored, and where such results stand."""
+
+import json
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from splashbench.cli.main import main
+from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.harness.runner import run_method
+from splashbench.harness.training_copy import make_training_view
+from splashbench.scene import Camera, Particles, Scene, TrainingScene
+from splashbench.score import score_submission
+from splashbench.submission.withheld import kept_timesteps, scored_timesteps
+
+METHOD = f"{Path(__file__).resolve()}:Clock"
+
+
+class Clock(Method):
+    """Shows how bright the time is, and says what it was shown."""
+
+    id, title = "clock", "the time as a grey"
+    Config: ClassVar[type[MethodConfig]] = MethodConfig
+
+    def fit(self, scene: TrainingScene, config: MethodConfig, run: Run) -> Fitted:
+        files = sorted(path.stem for path in (scene.directory / "ims" / scene.train[0]).iterdir())
+        return Hands({"times": scene.times.tolist(), "frames": scene.frames, "files": files})
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        return Hands(json.loads((directory / "seen.json").read_text()))
+
+
+class Hands(Fitted):
+    def __init__(self, seen: dict) -> None:
+        self.seen = seen
+
+    def render(self, camera: Camera, time: float) -> Render:
+        return Render(np.full((camera.height, camera.width, 3), time), np.zeros((camera.height, camera.width)))
+
+    def particles(self) -> Particles | None:
+        n = len(self.seen["times"])
+        return Particles(np.zeros((n, 1, 3)), np.ones((n, 1), bool))
+
+    def save(self, directory: Path) -> None:
+        (directory / "seen.json").write_text(json.dumps(self.seen))
+
+
+def test_which_timesteps() -> None:
+    assert kept_timesteps(7, "odd") == (0, 2, 4, 6)
+    assert scored_timesteps(7, "odd") == (1, 3, 5)
+    # The last one of an even number lies outside what was seen.
+    assert scored_timesteps(8, "odd") == (1, 3, 5)
+    assert kept_timesteps(3, None) == scored_timesteps(3, None) == (0, 1, 2)
+
+
+def test_the_method_sees_every_second_timestep_and_nothing_of_the_others(balls: Scene, tmp_path: Path) -> None:
+    view = Scene.open(make_training_view(balls, tmp_path / "view", (0, 2, 4, 6)))
+    assert view.frames == balls.frames[::2]
+    np.testing.assert_array_equal(view.times, balls.times[::2])
+    for name in balls.train:
+        np.testing.assert_array_equal(view.image(name, 1), balls.image(name, 2))
+        np.testing.assert_array_equal(view.mask(name, 3), balls.mask(name, 6))
+    stems = {path.stem for path in (tmp_path / "view" / "ims").rglob("*.*") if path.is_symlink()}
+    assert stems == set(balls.frames[::2])
+
+
+@pytest.fixture(scope="module")
+def result(balls: Scene, balls_directory: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    place = tmp_path_factory.mktemp("withheld")
+    words = ["run", METHOD, str(balls_directory), str(place / "odd"), "--withhold", "odd", "--timing-frames", "0"]
+    assert main(words) == 0
+    run_method(METHOD, balls_directory, place / "all", timing_frames=0)
+    return place / "odd", place / "all"
+
+
+def test_all_timesteps_are_rendered_at_their_own_times(result: tuple[Path, Path], balls: Scene) -> None:
+    from splashbench.submission import Submission
+
+    odd, whole = (Submission.open(path) for path in result)
+    for t in range(balls.n_frames):
+        shown = odd.rendering(balls.test[0], t)
+        np.testing.assert_array_equal(shown, whole.rendering(balls.test[0], t))
+        assert int(shown[0, 0, 0]) == round(255 * float(balls.times[t]))
+    seen = json.loads((result[0] / "model" / "seen.json").read_text())
+    assert seen["times"] == balls.times[::2].tolist()
+    assert main(["check", str(result[0]), "--scene", str(balls.directory)]) == 0
+
+
+def test_the_withheld_ones_alone_are_scored(result: tuple[Path, Path], balls: Scene, tmp_path: Path) -> None:
+    from splashbench.submission import Submission
+
+    odd, whole = (score_submission(balls, Submission.open(path)) for path in result)
+    view = balls.test[0]
+    of_odd, of_all = odd.metrics["psnr"].views[view].frames, whole.metrics["psnr"].views[view].frames
+    assert of_odd == tuple(value if t in (1, 3, 5) else None for t, value in enumerate(of_all))
+    assert odd.metrics["psnr"].skipped_frames == 0
+    assert odd.value("psnr") != whole.value("psnr")
+    assert odd.value("sigma_d") is None
+    for scored in (odd, whole):
+        scored.save(tmp_path / "results")
+    assert main(["leaderboard", str(tmp_path / "results"), str(tmp_path / "board")]) == 0
+    board = (tmp_path / "board" / "leaderboard.csv").read_text()
+    assert "v1, odd timesteps withheld" in board
+    assert len(board.splitlines()) == 3
+
+
+def test_two_timesteps_are_too_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from splashbench.synth.balls import write_balls_scene
+
+    write_balls_scene(tmp_path / "two", n_frames=2)
+    assert main(["run", "hull_points", str(tmp_path / "two"), str(tmp_path / "out"), "--withhold", "odd"]) == 1
+    assert "takes three" in capsys.readouterr().err

@@ -1,0 +1,372 @@
+"""What gravity says: jets in free fall, the level of a pool, where carriers land, and what a view can see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splashbench.observe import Silhouettes, sequence_bounds
+from splashbench.observe.container import depth_image
+from splashbench.observe.grid import Bounds, Grid
+from splashbench.observe.hull import carve_frame
+from splashbench.observe.occlusion import ContainerShadow
+from splashbench.scene.camera import Camera
+from splashbench.scene.container import ContainerMesh
+from splashbench_methods.splashsplat.appearance.visibility import seen_by_any
+from splashbench_methods.splashsplat.fields.pool import Pool, Vessel, upright
+from splashbench_methods.splashsplat.fields.survey import survey
+from splashbench_methods.splashsplat.motion.ballistic import Jet, Slices, fit_jets, framed, open_floor, slices_of
+from splashbench_methods.splashsplat.motion.gate import gated
+from splashbench_methods.splashsplat.motion.step import Fall, Motion, Step, falls_of
+from splashbench_methods.splashsplat.motion.velocity import control_shape, velocity_at
+
+DOWN = np.array([0.0, -1.0, 0.0])
+G = 9.81
+VOXEL = 0.005
+
+
+def looking_at(name: str, eye: np.ndarray, target: np.ndarray, size: tuple[int, int] = (160, 120)) -> Camera:
+    """A pinhole camera at `eye` looking at `target`, y of the world up."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = rotation, -rotation @ eye
+    K = np.array([[1.2 * size[0], 0, size[0] / 2], [0, 1.2 * size[0], size[1] / 2], [0, 0, 1.0]])
+    return Camera(name, *size, K, w2c)
+
+
+def rig(target: np.ndarray, distance: float = 1.0, elevation: float = 30.0) -> dict[str, Camera]:
+    """Five cameras on an arc of 80 degrees, as the paper's."""
+    cameras = {}
+    for number, turn in enumerate(np.radians([-40, -20, 0, 20, 40])):
+        up = np.radians(elevation)
+        offset = np.array([np.sin(turn) * np.cos(up), np.sin(up), np.cos(turn) * np.cos(up)])
+        cameras[str(number)] = looking_at(str(number), target + distance * offset, target)
+    return cameras
+
+
+def open_box(inner: tuple[float, float, float], wall: float) -> ContainerMesh:
+    """A closed mesh: a box of `inner` width, height and depth with an open top, its floor's upper side at y = 0."""
+    w, h, d = inner[0] / 2, inner[1], inner[2] / 2
+    outer = [(sx * (w + wall), y, sz * (d + wall)) for y in (-wall, h) for sx in (-1, 1) for sz in (-1, 1)]
+    inside = [(sx * w, y, sz * d) for y in (0, h) for sx in (-1, 1) for sz in (-1, 1)]
+    quads = [(0, 1, 3, 2), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]  # the outside, without the top
+    quads += [(8, 10, 11, 9), (8, 9, 13, 12), (10, 14, 15, 11), (8, 12, 14, 10), (9, 11, 15, 13)]  # the inside
+    quads += [(4, 12, 13, 5), (6, 7, 15, 14), (4, 6, 14, 12), (5, 13, 15, 7)]  # the rim
+    faces = [triangle for a, b, c, e in quads for triangle in ((a, b, c), (a, c, e))]
+    return ContainerMesh(np.array(outer + inside), np.array(faces))
+
+
+# Jets
+
+
+def falling(speed: float, drift: float, flow: float = 6e-4, wander: float = 0.0, n_frames: int = 9) -> list[Slices]:
+    """Slices of a jet that passes height 0.3 with `speed` down, `drift` sideways, and carries `flow` m^3/s."""
+    frames = []
+    for t in range(n_frames):
+        height = (np.arange(20, 60) + 0.5) * VOXEL
+        down = np.sqrt(speed**2 + 2 * G * (0.3 - height))
+        fall = (down - speed) / G
+        middle = np.stack([0.01 + wander * t + drift * fall, -0.02 + 0 * fall], axis=1)
+        rng = np.random.default_rng(t)
+        middle += rng.normal(0, 0.1 * VOXEL, middle.shape)
+        area = flow / down * np.exp(rng.normal(0, 0.05, len(height)))
+        frames.append(Slices(height, middle, area))
+    return frames
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.001])
+@pytest.mark.parametrize(("speed", "drift"), [(1.0, 0.35), (0.5, 0.2), (2.0, 0.6)])
+def test_a_jets_speed_follows_from_its_shape(speed, drift, wander):
+    jets = fit_jets(falling(speed, drift, wander=wander), np.arange(9) * 0.05, G, VOXEL)
+    assert all(jet is not None for jet in jets)
+    for t in (0, 4, 8):
+        heights = np.array([0.12, 0.2, 0.29])
+        down = np.sqrt(speed**2 + 2 * G * (0.3 - heights))
+        found = jets[t].velocity(heights)
+        np.testing.assert_allclose(found[:, 2], -down, rtol=0.12)
+        np.testing.assert_allclose(found[:, 0], drift, rtol=0.12)
+        np.testing.assert_allclose(found[:, 1], 0, atol=0.05)
+
+
+@pytest.mark.parametrize(("speed", "drift"), [(1.0, 0.35), (0.5, 1.0)])
+def test_a_jets_axis_and_width_lead_through_its_slices(speed, drift):
+    frames = falling(speed, drift)
+    jet = fit_jets(frames, np.arange(9) * 0.05, G, VOXEL)[4]
+    axis = np.concatenate([frames[4].middle, frames[4].height[:, None]], axis=1)
+    assert (jet.distance(axis) < 0).all()
+    radius = np.sqrt(frames[4].area / np.pi)
+    np.testing.assert_allclose(-jet.distance(axis), radius, atol=0.4 * VOXEL)
+
+
+def test_a_falling_tip_tells_the_speed_of_a_straight_jet():
+    """A vertical jet bends nowhere; its first drop and its thinning still show how fast it is."""
+    times = np.arange(8) * 0.02
+    frames = []
+    for time in times:
+        height = (np.arange(20, 60) + 0.5) * VOXEL
+        tip = 0.3 - 1.0 * time - 0.5 * G * time**2
+        height = height[height >= tip]
+        frames.append(Slices(height, np.zeros((len(height), 2)), 6e-4 / np.sqrt(1 + 2 * G * (0.3 - height))))
+    speed = fit_jets(frames, times, G, VOXEL)[-1].velocity(np.array([0.3]))[0, 2]
+    assert speed == pytest.approx(-1.0, rel=0.12)
+
+
+def test_no_liquid_in_the_air_means_no_jet():
+    nothing = Slices(np.zeros(0), np.zeros((0, 2)), np.zeros(0))
+    assert fit_jets([nothing] * 3, np.arange(3.0), G, VOXEL) == [None] * 3
+    alone = falling(1.0, 0.3, n_frames=2)
+    jets = fit_jets([*alone, *[nothing] * 9], np.arange(11) * 0.05, G, VOXEL)
+    assert jets[0] is not None
+    assert jets[-1] is None
+
+
+def test_slices_have_the_middle_and_the_area_of_a_cylinder():
+    axes = np.arange(-10, 11) * VOXEL
+    points = np.stack(np.meshgrid(axes, axes, np.arange(20) * VOXEL, indexing="ij"), -1).reshape(-1, 3)
+    distance = np.hypot(points[:, 0] - 0.012, points[:, 1] + 0.008) - 0.022
+    slices = slices_of(points, np.clip(0.5 - distance / VOXEL, 0, 1), VOXEL)
+    assert len(slices.height) == 20
+    np.testing.assert_allclose(slices.middle, [[0.012, -0.008]] * 20, atol=0.02 * VOXEL)
+    np.testing.assert_allclose(slices.area, np.pi * 0.022**2, rtol=0.01)
+    assert (slices.above(0.05).height > 0.05).all()
+    assert len(slices.above(0.05).height) == 10
+
+
+def test_without_a_container_the_stream_ends_where_the_body_begins():
+    height = (np.arange(40) + 0.5) * VOXEL
+    area = np.where(height < 0.06, 1e-2, 4e-4)
+    body = Slices(height, np.zeros((40, 2)), area)
+    assert open_floor([body] * 3, VOXEL) == pytest.approx(0.06 + 1.5 * VOXEL, abs=VOXEL)
+    assert open_floor([Slices(np.zeros(0), np.zeros((0, 2)), np.zeros(0))], VOXEL) == np.inf
+
+
+def test_slices_cut_by_an_image_edge_are_left_out():
+    camera = looking_at("0", np.array([0, 0.2, 1.0]), np.array([0, 0.2, 0.0]))
+    height = np.linspace(-0.4, 0.8, 25)
+    slices = Slices(height, np.zeros((25, 2)), np.full(25, np.pi * 0.02**2))
+    kept = framed(slices, [camera], upright(DOWN))
+    top = 0.2 + 60 / 192  # half the image's height over the focal length, a metre away
+    assert 0 < len(kept.height) < 25
+    assert kept.height.max() < top - 0.02
+    assert kept.height.max() > top - 0.12
+
+
+# Motion
+
+
+GRID = Grid(np.array([-0.1, 0.0, -0.1]), VOXEL, (40, 64, 40))
+JET = Jet(0.3, np.array([0.0, 0.0]), np.array([0.2, -0.1]), 1.0, G, 0.01)
+FALL = Fall(JET, 0.1, upright(DOWN), GRID, 0.033)
+SIDEWAYS = np.broadcast_to(np.float32([1, 0, 0]), (*control_shape(GRID.shape, 4), 3))
+
+
+def in_the_jet(heights: np.ndarray, aside: float = 0.0) -> np.ndarray:
+    """Grid coordinates [N, 3] at `heights`, so far (scene units) beside the jet's middle."""
+    points = np.concatenate([JET.axis(heights) + np.array([aside, 0]), heights[:, None]], axis=1)
+    return GRID.to_voxels(points @ upright(DOWN)).astype(np.float32)
+
+
+def eyes(count: int) -> np.ndarray:
+    return np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
+
+
+def test_what_is_in_the_jet_falls_and_what_is_beside_it_follows_the_fit():
+    heights = np.array([0.15, 0.2, 0.25])
+    step = Step(SIDEWAYS, 4, FALL)
+    found = step.velocity(in_the_jet(heights)) * VOXEL / 0.033
+    np.testing.assert_allclose(found, JET.velocity(heights) @ upright(DOWN), rtol=1e-5)
+    for elsewhere in (in_the_jet(heights, aside=0.011 + VOXEL), in_the_jet(np.array([0.05, 0.09]))):
+        np.testing.assert_array_equal(step.velocity(elsewhere), np.broadcast_to([1.0, 0, 0], elsewhere.shape))
+        moved, F = step.forecast(elsewhere, eyes(len(elsewhere)))
+        np.testing.assert_allclose(moved, elsewhere + np.array([1, 0, 0]), atol=1e-5)
+        np.testing.assert_allclose(F, eyes(len(elsewhere)), atol=1e-6)
+
+
+def test_carriers_in_the_jet_fly_on_their_parabola_and_stretch():
+    start = in_the_jet(np.array([0.26]))
+    moved, F = Step(SIDEWAYS, 4, FALL).forecast(start, eyes(1))
+    rise = np.array([0.0, 0.0, 1.0]) @ upright(DOWN)
+    way = JET.velocity(np.array([0.26])) @ upright(DOWN) * 0.033 - 0.5 * G * 0.033**2 * rise
+    np.testing.assert_allclose(moved, start + way / VOXEL, atol=1e-4)
+    # It is still in the middle of the jet, and has the speed that the jet has there.
+    height = (GRID.to_scene(moved) @ upright(DOWN).T)[:, 2]
+    np.testing.assert_allclose(moved, in_the_jet(height), atol=1e-3)
+    # Two carriers on top of each other part as F says: speeds grow downwards.
+    tip = 1e-2 * rise / VOXEL
+    apart = (Step(SIDEWAYS, 4, FALL).forecast(start + tip.astype(np.float32), eyes(1))[0] - moved) / 1e-2 * VOXEL
+    np.testing.assert_allclose(F[0] @ rise, apart[0], atol=0.02)
+    assert F[0] @ rise @ rise > 1.05
+    # One that lands within the first half of the step is left to the fit.
+    low = in_the_jet(np.array([0.1 + 0.4 * 0.033 * 1.0]))
+    np.testing.assert_allclose(Step(SIDEWAYS, 4, FALL).forecast(low, eyes(1))[0], low + np.array([1, 0, 0]), atol=1e-5)
+    # Halves of a step, forwards or backwards, make whole ones.
+    half = Step(SIDEWAYS, 4, FALL).forecast(*Step(SIDEWAYS, 4, FALL).forecast(start, eyes(1), 0.5), 0.5)[0]
+    np.testing.assert_allclose(half, moved, atol=1e-3)
+    back = Step(SIDEWAYS, 4, FALL).forecast(moved, eyes(1), -1.0)[0]
+    np.testing.assert_allclose(back, start, atol=1e-3)
+
+
+def test_motion_is_read_as_it_was_written():
+    motion = Motion(np.stack([SIDEWAYS, SIDEWAYS]), 4, [None, FALL])
+    again = falls_of(*motion.table(), GRID, np.array([0.0, 0.1, 0.133]))
+    assert again[0] is None
+    assert again[1] is not None
+    points = in_the_jet(np.array([0.15, 0.25]))
+    np.testing.assert_allclose(again[1].velocity(points), FALL.velocity(points), rtol=1e-12)
+    np.testing.assert_array_equal(again[1].holds(points), [True, True])
+    assert motion.half().velocities.dtype == np.float16
+    with pytest.raises(ValueError, match="jets of shape"):
+        falls_of(*motion.table(), GRID, np.array([0.0, 0.1]))
+    rows, turn = motion.table()
+    rows[1, 6] = 0
+    with pytest.raises(ValueError, match="gravity"):
+        falls_of(rows, turn, GRID, np.array([0.0, 0.1, 0.133]))
+
+
+def test_a_fit_that_leads_nowhere_is_dropped_and_one_that_leads_home_is_kept():
+    nodes = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), -1)
+
+    def ball(x: float) -> np.ndarray:
+        return (np.linalg.norm(nodes - [x, 20, 20], axis=-1) - 8).astype(np.float32)
+
+    right = np.zeros((10, 10, 10, 3), np.float32)
+    right[..., 0] = 3
+    kept = gated(right, 4, ball(17), ball(20))
+    assert velocity_at(kept, 4, 24.0, 20.0, 20.0)[0] == pytest.approx(3)
+    assert np.abs(velocity_at(gated(right, 4, ball(17), ball(17)), 4, 17.0, 20.0, 20.0)).max() == 0
+    # A slow surface gains next to nothing by its own motion, and keeps it.
+    slow = 0.02 * right
+    assert velocity_at(gated(slow, 4, ball(17), ball(17.06)), 4, 20.0, 20.0, 20.0)[0] == pytest.approx(0.06)
+
+
+# The pool
+
+
+class PouredBox:
+    """A box of liquid in an open box, seen by five cameras; what `Silhouettes` needs of a scene."""
+
+    def __init__(self, level: float, opaque: bool = True, floating: bool = False) -> None:
+        self.name, self.n_frames, self.train = "box", 2, ("0", "1", "2", "3", "4")
+        self.mesh = open_box((0.2, 0.12, 0.16), 0.008)
+        self.cameras = rig(np.array([0.0, 0.05, 0.0]))
+        axes = np.meshgrid(np.linspace(-0.1, 0.1, 160), np.linspace(0, level, 60), np.linspace(-0.08, 0.08, 130))
+        self.points = np.stack(axes, -1).reshape(-1, 3)
+        self.opaque = opaque
+        self.masks = {name: self._mask(camera) for name, camera in self.cameras.items()}
+        if floating:
+            self.masks["2"][0:6, 0:6] = True
+
+    def _mask(self, camera: Camera) -> np.ndarray:
+        pixels, depth = camera.project(self.points)
+        column, row = np.floor(pixels).astype(int).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        if self.opaque:
+            shadow = depth_image(self.mesh, camera)
+            inside[inside] = depth[inside] <= shadow[row[inside], column[inside]] + 1e-3
+        mask = np.zeros((camera.height, camera.width), bool)
+        mask[row[inside], column[inside]] = True
+        return mask
+
+    def mask(self, camera: str, t: int) -> np.ndarray:
+        return self.masks[camera]
+
+
+@pytest.fixture(scope="module")
+def poured() -> PouredBox:
+    return PouredBox(0.06)
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_the_level_is_where_the_masks_end_on_the_wall(opaque):
+    scene = PouredBox(0.05, opaque)
+    vessel = Vessel.of(scene.mesh, DOWN)
+    assert vessel.rim == pytest.approx(0.12, abs=0.01)
+    levels = Pool(vessel, Silhouettes(scene), opaque).levels()
+    np.testing.assert_allclose(levels, 0.05, atol=0.005)
+
+
+def test_gravity_may_point_anywhere(poured):
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    mesh = ContainerMesh(poured.mesh.vertices @ turn.T, poured.mesh.faces)
+    straight, turned = Vessel.of(poured.mesh, DOWN), Vessel.of(mesh, turn @ DOWN)
+    volumes = [vessel.inside.sum() * vessel.grid.voxel**3 for vessel in (straight, turned)]
+    assert volumes[0] == pytest.approx(0.2 * 0.12 * 0.16, rel=0.12)
+    assert volumes[1] == pytest.approx(volumes[0], rel=0.03)
+
+
+def test_a_plate_is_no_vessel():
+    corners = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (0, 0.01) for z in (-0.1, 0.1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    flat = ContainerMesh(corners, np.array([t for a, b, c, e in quads for t in ((a, b, c), (a, c, e))]))
+    assert Vessel.of(flat, DOWN) is None
+
+
+def test_the_dome_over_a_pool_goes_and_the_pool_is_full(poured):
+    silhouettes = Silhouettes(poured)
+    container = ContainerShadow(poured.mesh, DOWN)
+    grid = Grid.over(sequence_bounds(silhouettes, container).padded(0.1), 56)
+    phi = carve_frame(silhouettes, grid, 0)
+    shadows = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
+    settled = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi, grid, 0.06, shadows)
+    points = grid.nodes()
+    truth = (np.abs(points[..., 0]) < 0.1) & (np.abs(points[..., 2]) < 0.08) & (points[..., 1] > 0)
+    truth &= points[..., 1] < 0.06
+
+    def overlap(field: np.ndarray) -> float:
+        return float(((field < 0) & truth).sum() / ((field < 0) | truth).sum())
+
+    assert overlap(phi) < 0.5
+    assert overlap(settled) > 0.85
+    floating = points[..., 1] > 0.06 + 2 * grid.voxel
+    # A mask's outermost pixels are wider than the pool; little more may stay.
+    assert (settled[floating] < 0).sum() < 0.15 * (phi[floating] < 0).sum()
+
+
+def test_what_falls_into_the_pool_is_kept(poured):
+    silhouettes = Silhouettes(poured)
+    grid = Grid.over(Bounds(np.array([-0.12, -0.02, -0.1]), np.array([0.12, 0.2, 0.1])), 48)
+    jet = Jet(0.2, np.zeros(2), np.zeros(2), 1.0, G, 0.02)
+    phi = np.full(grid.shape, -5, np.float32)
+    pool = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True)
+    shadows = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
+    low, kept = pool.lowered(phi, grid, 0.06, shadows), pool.lowered(phi, grid, 0.06, shadows, jet)
+    node = tuple(np.round(grid.to_voxels(np.array([0.0, 0.09, 0.0]))).astype(int))
+    assert low[node] > 0 > kept[node]
+
+
+# Landing
+
+
+def test_carriers_land_on_the_pool_and_on_the_walls(poured):
+    silhouettes = Silhouettes(poured)
+    container = ContainerShadow(poured.mesh, DOWN)
+    bounds = sequence_bounds(silhouettes, container).padded(0.1)
+    shadows = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
+    known = survey(silhouettes, bounds, container, DOWN, None, np.arange(2.0), shadows)
+    assert known.jets == [None, None]
+    grid = Grid.over(Bounds(np.full(3, -0.2), np.full(3, 0.2)), 80)
+    start = grid.to_voxels(np.array([[0, 0.15, 0], [0, 0.03, 0], [0, 0.15, 0], [0, 0.15, 0]]))
+    end = grid.to_voxels(np.array([[0.01, -0.05, 0], [0, 0.02, 0], [0.15, 0.07, 0], [0.15, 0.15, 0]]))
+    rest = grid.to_scene(known.landed(grid, 1, start, end))
+    assert rest[0, 1] == pytest.approx(known.levels[1], abs=1e-4)
+    np.testing.assert_allclose(rest[1], [0, 0.02, 0], atol=1e-6)
+    assert 0.09 < rest[2, 0] < 0.102  # it met the wall's inner side on its way
+    np.testing.assert_allclose(rest[3], [0.15, 0.15, 0], atol=1e-6)
+
+
+# Visibility
+
+
+def test_a_camera_sees_its_own_side_of_the_liquid_only():
+    grid = Grid(np.full(3, -1.0), 0.05, (41, 41, 41))
+    phi = ((np.linalg.norm(grid.nodes(), axis=-1) - 0.6) / 0.05).astype(np.float32)
+    camera = looking_at("0", np.array([0, 0, 4.0]), np.zeros(3))
+    points = grid.to_voxels(np.array([[0, 0, 0.55], [0, 0, -0.55], [0.3, 0, 0.45], [0, 0, 0.0]]))
+    assert seen_by_any(phi, grid, points, [camera], [None], 3).tolist() == [True, False, True, False]
+    behind = looking_at("1", np.array([0, 0, -4.0]), np.zeros(3))
+    assert seen_by_any(phi, grid, points, [camera, behind], [None, None], 3).tolist() == [True, True, True, False]
+    wall = np.full((camera.height, camera.width), 2.0, np.float32)
+    assert not seen_by_any(phi, grid, points, [camera], [wall], 3).any()

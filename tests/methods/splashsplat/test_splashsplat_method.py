@@ -1,0 +1,240 @@
+"""SplashSplat from images to images on balls in free flight, whose shape, place and times are known exactly."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.harness.contract import Run
+from splashbench.scene import Scene
+from splashbench.synth.balls import ball_centers, write_balls_scene
+from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.subframe import locate
+
+TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
+
+
+@pytest.fixture(scope="module")
+def fitted(balls: Scene) -> FittedSplashSplat:
+    return SplashSplat().fit(balls.training(), SplashSplatConfig.preset("quick", TINY), Run(seed=1))
+
+
+def liquid_only(scene: Scene, seed: int = 1, **overrides: object) -> Liquid:
+    """The liquid over a grey background, without the time that a real background takes."""
+    training = scene.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+    config = SplashSplatConfig.preset("quick", TINY | {"iterations": 10} | overrides)
+    return fit_liquid(training, grey, config, Run(seed=seed))[0]
+
+
+def test_it_beats_its_own_background_at_the_test_views(balls: Scene, fitted: FittedSplashSplat):
+    gains, overlaps = [], []
+    for name in balls.test:
+        camera = balls.cameras[name]
+        for t in range(balls.n_frames):
+            mask, truth = balls.mask(name, t), balls.image(name, t) / 255
+            render = fitted.render(camera, balls.times[t])
+            assert render.rgb.shape == (camera.height, camera.width, 3)
+            assert render.rgb.dtype == render.alpha.dtype == np.float32
+            assert render.rgb.min() >= 0
+            assert render.rgb.max() <= 1
+            errors = [((image - truth)[mask] ** 2).mean() for image in (render.rgb, fitted.background.render(camera))]
+            gains.append(10 * np.log10(errors[1] / errors[0]))
+            found = render.alpha > 0.5
+            overlaps.append((found & mask).sum() / (found | mask).sum())
+    assert np.mean(gains) > 4
+    assert np.mean(overlaps) > 0.75
+
+
+def test_a_saved_model_renders_the_same_image_in_a_fresh_process(
+    balls: Scene, balls_directory: Path, fitted: FittedSplashSplat, tmp_path: Path
+):
+    fitted.save(tmp_path)
+    name, times = balls.test[0], [float(balls.times[3]), 0.4 * balls.times[3] + 0.6 * balls.times[4]]
+    code = f"""
+import numpy as np
+from pathlib import Path
+from splashbench.scene import Scene
+from splashbench_methods.splashsplat import SplashSplat
+scene = Scene.open(Path({str(balls_directory)!r}))
+model = SplashSplat().load(Path({str(tmp_path)!r}), scene.training())
+views = [model.render(scene.cameras[{name!r}], time) for time in {times!r}]
+np.savez({str(tmp_path / "views.npz")!r}, rgb=[v.rgb for v in views], alpha=[v.alpha for v in views])
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+    views = np.load(tmp_path / "views.npz")
+    for i, time in enumerate(times):
+        here = fitted.render(balls.cameras[name], time)
+        np.testing.assert_array_equal(views["rgb"][i], here.rgb)
+        np.testing.assert_array_equal(views["alpha"][i], here.alpha)
+    assert (tmp_path / "static").is_dir()
+    assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} <= {".json", ".npz"}
+
+
+def test_particles_are_the_carriers_near_the_balls(balls: Scene, fitted: FittedSplashSplat):
+    particles = fitted.particles()
+    assert particles.positions.shape[0] == balls.n_frames
+    assert particles.active.any(axis=1).all()
+    for t in (0, 4, balls.n_frames - 1):
+        distance = np.linalg.norm(particles.at(t)[:, None] - ball_centers(balls.times[t]), axis=2).min(axis=1)
+        assert np.median(distance) < 0.12  # the largest ball's radius is 0.1
+    assert np.isfinite(particles.velocities).all()
+
+
+def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, fitted: FittedSplashSplat):
+    particles = fitted.particles()
+    births, ends = fitted.liquid.carriers.births_and_ends()
+    frame = np.arange(balls.n_frames)[:, None]
+    np.testing.assert_array_equal(particles.active, (frame >= births) & (frame <= ends))
+    assert (ends > births).mean() > 0.3  # enough of them live on for the energy to mean something
+    # Between two frames of its life a carrier moves by the velocity (at most 8 voxels) and the correction (at most 1).
+    alive = particles.active[1:] & particles.active[:-1]
+    moved = np.linalg.norm(np.diff(particles.positions, axis=0), axis=2)[alive] / fitted.liquid.grid.voxel
+    assert moved.max() <= 9.05
+    # What it does between them is the forecast, but for the correction.
+    liquid = fitted.liquid
+    for t in range(balls.n_frames - 1):
+        rows, lives = liquid.carriers.rows(t), alive[t, liquid.carriers.ids[liquid.carriers.rows(t)]]
+        x, F = liquid.carriers.positions[rows][lives], liquid.carriers.deformation[rows][lives]
+        ids = liquid.carriers.ids[rows][lives]
+        there, _ = liquid.motion.step(t).forecast(x, F)
+        off = np.linalg.norm(liquid.grid.to_voxels(particles.positions[t + 1, ids]) - there, axis=1)
+        assert off.max() <= 1.05
+
+
+def test_particle_velocities_are_seconds_not_frames(balls: Scene, fitted: FittedSplashSplat):
+    particles = fitted.particles()
+    steps = np.diff(balls.times)
+    speeds = [np.linalg.norm(particles.velocities[t][particles.active[t]], axis=1) for t in range(len(steps))]
+    displacements = [speed * step / fitted.liquid.grid.voxel for speed, step in zip(speeds, steps)]
+    assert max(map(np.max, displacements)) <= 8.01  # the fit's limit, voxels a frame
+    assert 0.2 < np.median(np.concatenate(speeds)) < 3  # the balls fly at about a metre a second
+
+
+def test_between_frames_carriers_move_on_and_appearance_stays(balls: Scene, fitted: FittedSplashSplat):
+    liquid = fitted.liquid
+    start, stop = liquid.times[2], liquid.times[3]
+
+    def at(share: float) -> tuple[torch.Tensor, torch.Tensor]:
+        ids, state = liquid.track.at(liquid.times, (1 - share) * start + share * stop)
+        return ids, state.positions
+
+    ids, before = at(0)
+    for near, far in ((0.25, 0.5), (0.8, 0.6)):  # from the frame before, and back from the one after
+        whose, exact = (ids, before) if near < 0.5 else at(1)
+        moved = [(at(share)[1] - exact).norm(dim=1) for share in (near, far)]
+        assert all(torch.equal(at(share)[0], whose) for share in (near, far))
+        assert float(moved[0].mean()) > 0
+        assert float((moved[1] / moved[0].clamp_min(1e-6)).median()) == pytest.approx(2, abs=0.15)
+    exact, _ = liquid.track.at(liquid.times, float(stop) + 1e-9)
+    np.testing.assert_array_equal(exact, liquid.carriers.ids[liquid.carriers.rows(3)])
+
+
+def test_either_side_of_the_middle_of_a_step_is_the_same_place(balls: Scene, fitted: FittedSplashSplat):
+    """Carriers that live through the step are nearly where both frames say, against what they move in it."""
+    liquid = fitted.liquid
+    step = liquid.times[5] - liquid.times[4]
+    (ids, here), (after, there) = (liquid.track.at(liquid.times, liquid.times[4] + f * step) for f in (0.49, 0.51))
+    _, mine, theirs = np.intersect1d(ids.numpy(), after.numpy(), return_indices=True)
+    gap = (here.positions[mine] - there.positions[theirs]).norm(dim=1)
+    way = (liquid.track.state(5).positions[theirs] - liquid.track.state(4).positions[mine]).norm(dim=1)
+    assert len(mine) > 100
+    assert float(gap.median()) < 0.25 * float(way.median())
+
+
+@pytest.mark.parametrize(
+    ("time", "frame", "fraction"),
+    [
+        (-1, 0, 0),
+        (0, 0, 0),
+        (0.25, 0, 0.25),
+        (0.75, 1, -0.25),
+        (1.0000001, 1, 0),
+        (2.0, 1, 0.5),
+        (2.5, 2, -0.25),
+        (2.9999999, 2, 0),
+        (9, 2, 0),
+    ],
+)
+def test_times_are_located_on_uneven_steps(time, frame, fraction):
+    assert locate(np.array([0.0, 1.0, 3.0]), time) == (frame, pytest.approx(fraction))
+
+
+def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(tmp_path: Path):
+    """Three of five cameras expose up to half a step early or late; the test views are in time."""
+    n_frames = 6
+    step = 0.33 / (n_frames - 1)
+    delays = {"1": -0.4 * step, "3": 0.45 * step, "5": -0.3 * step}
+    scene = write_balls_scene(tmp_path / "late", n_frames=n_frames, delays=delays)
+    psnr = {}
+    for camera_times in (True, False):
+        config = SplashSplatConfig.preset("quick", TINY | {"camera_times": camera_times})
+        fitted = SplashSplat().fit(scene.training(), config, Run(seed=1))
+        for views in (tuple(delays), scene.test):
+            values = []
+            for name in views:
+                for t in range(1, n_frames - 1):
+                    mask = scene.mask(name, t)
+                    render = fitted.render(scene.cameras[name], float(scene.camera_times[name][t]))
+                    values.append(-10 * np.log10(((render.rgb - scene.image(name, t) / 255)[mask] ** 2).mean()))
+            psnr[camera_times, views] = np.mean(values)
+    assert psnr[True, tuple(delays)] > psnr[False, tuple(delays)] + 0.7
+    assert psnr[True, scene.test] > psnr[False, scene.test] + 0.2
+
+
+def test_the_same_seed_gives_the_same_liquid_bit_for_bit(balls: Scene):
+    first, second, other = liquid_only(balls), liquid_only(balls), liquid_only(balls, seed=2)
+    assert torch.equal(first.appearance.features, second.appearance.features)
+    np.testing.assert_array_equal(first.carriers.positions, second.carriers.positions)
+    np.testing.assert_array_equal(first.motion.velocities, second.motion.velocities)
+    assert not torch.equal(first.appearance.features[:100], other.appearance.features[:100])
+
+
+def test_the_ablations_differ_as_the_paper_says(balls: Scene):
+    full = liquid_only(balls, prune_opacity=0)
+    alone = liquid_only(balls, prune_opacity=0, variant="no_resampling")
+    anew = liquid_only(balls, prune_opacity=0, variant="per_frame")
+    last = balls.n_frames - 1
+    active = [np.diff(liquid.carriers.starts)[last] for liquid in (full, alone, anew)]
+    assert active[1] < 0.7 * active[0]  # without resampling carriers die out
+    assert full.carriers.count < 0.9 * anew.carriers.count  # transport stores fewer than reseeding
+    assert (anew.motion.velocities == 0).all()
+
+
+def test_transparent_carriers_are_dropped(balls: Scene):
+    kept = liquid_only(balls, prune_opacity=0)
+    opacity = kept.appearance.decoder.mean_opacity(kept.appearance.features).detach()
+    strict = liquid_only(balls, prune_opacity=float(opacity.median()))
+    assert strict.carriers.count == pytest.approx(0.5 * kept.carriers.count, rel=0.05)
+    assert len(strict.appearance.features) == strict.carriers.count
+    assert strict.carriers.ids.max() == strict.carriers.count - 1
+
+
+def test_a_scene_without_masks_is_not_supported(balls: Scene):
+    training = balls.training()
+    training.mask = lambda camera, t: np.zeros((4, 4), dtype=bool)
+    support = SplashSplat().supports(training)
+    assert not support.ok
+    assert "liquid masks" in support.reason
+    assert SplashSplat().supports(balls.training()).ok
+
+
+def test_the_paper_preset_is_the_papers():
+    paper = SplashSplatConfig.preset("paper")
+    assert (paper.hull_cells, paper.transport_cells, paper.control_cells) == (176, 96, 24)
+    assert paper.control_factor == 4
+    assert (paper.iterations, paper.learning_rate_features, paper.learning_rate_heads) == (3000, 2e-3, 2e-3)
+    weights = paper.optimisation.weights
+    assert tuple(vars(weights).values()) == (0.5, 0.1, 0.2, 0.7, 0.01, 0.1, 1.0)
+    velocity = paper.velocity
+    assert (velocity.steps, velocity.step_size, velocity.band, velocity.limit) == (35, 0.45, 4.0, 8.0)
+    shell = paper.carriers.shell
+    assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
+    assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)

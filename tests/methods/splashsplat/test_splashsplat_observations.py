@@ -1,0 +1,112 @@
+"""Observation fields shared by the runs of a study: the same to the last bit, by what they depend on."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splashbench.harness.contract import Run
+from splashbench.scene import Scene
+from splashbench_methods.splashsplat.fields import observations
+from splashbench_methods.splashsplat.fields.observations import Observations
+from splashbench_methods.splashsplat.settings import SplashSplatConfig
+
+SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 8, "velocity_steps": 3}
+
+
+def _observed(scene: Scene, run: Run, **settings: object) -> tuple[list[np.ndarray], Observations]:
+    config = SplashSplatConfig.model_validate({**SMALL, **settings})
+    observed = Observations(scene.training(), config, run, lambda done, message: None)
+    return list(observed), observed
+
+
+def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path) -> None:
+    alone, by_itself = _observed(balls, Run())
+    runs = [Run(cache=tmp_path), Run(cache=tmp_path, seed=1)]
+    for run in runs:
+        phi, observed = _observed(balls, run)
+        np.testing.assert_array_equal(phi, alone)
+        np.testing.assert_array_equal(observed.packed, by_itself.packed)
+        np.testing.assert_array_equal(observed.motion.velocities, by_itself.motion.velocities)
+        np.testing.assert_array_equal(observed.hull_grid.origin, by_itself.hull_grid.origin)
+    assert np.any(by_itself.motion.velocities)
+    first, second = runs
+    assert first.reused == {}
+    assert list(second.reused) == ["bounds", "distances", "velocities"]
+    assert "velocity" in first.stages
+    assert "velocity" not in second.stages
+    assert "failed masks" not in second.stages
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken_over"),
+    [
+        ({"lifetime": 5, "iterations": 7}, ["bounds", "distances", "velocities"]),
+        ({"gate_motion": False}, ["bounds", "distances"]),
+        ({"velocity_smoothing": 1.0}, ["bounds", "distances"]),
+        ({"transport_cells": 20}, ["bounds", "distances"]),
+        ({"variant": "per_frame"}, ["bounds", "distances"]),
+        ({"hull_cells": 36}, []),
+        ({"distance": "carve"}, []),
+        ({"detect_failures": False}, []),
+        ({"container": False}, []),
+        ({"camera_times": False}, []),
+        ({"pool": False}, []),
+        ({"ballistic": False}, []),
+    ],
+)
+def test_another_run_takes_over_what_its_settings_leave_as_it_was(
+    balls: Scene, tmp_path: Path, settings: dict[str, object], taken_over: list[str]
+) -> None:
+    _observed(balls, Run(cache=tmp_path))
+    run = Run(cache=tmp_path)
+    shared_phi, shared = _observed(balls, run, **settings)
+    assert list(run.reused) == taken_over
+    phi, alone = _observed(balls, Run(), **settings)
+    np.testing.assert_array_equal(shared_phi, phi)
+    np.testing.assert_array_equal(shared.packed, alone.packed)
+    np.testing.assert_array_equal(shared.motion.velocities, alone.motion.velocities)
+
+
+def test_masks_that_failed_stay_distrusted(balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    distrusted = np.zeros((balls.n_frames, len(balls.train)), dtype=bool)
+    distrusted[[1, 4], [0, 2]] = True
+    monkeypatch.setattr(observations, "distrust_failed_masks", lambda masks, container: masks.distrust(distrusted))
+    _, first = _observed(balls, Run(cache=tmp_path))
+    monkeypatch.undo()
+    run = Run(cache=tmp_path)
+    _, second = _observed(balls, run)
+    assert list(run.reused) == ["bounds", "distances", "velocities"]
+    np.testing.assert_array_equal(first.silhouettes.failed_masks, distrusted)
+    np.testing.assert_array_equal(second.silhouettes.failed_masks, distrusted)
+
+
+def test_a_run_that_ends_in_the_middle_leaves_no_file_behind(
+    balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there: list[str] = []
+    real = observations.signed_distance_frames
+
+    def frames(*arguments: Any) -> Iterator[np.ndarray]:
+        yield next(real(*arguments))
+        # Were the process killed now, this is what would stay.
+        there.extend(path.name for path in tmp_path.iterdir() if path.is_file() and path.suffix != ".lock")
+        raise RuntimeError("in the middle")
+
+    monkeypatch.setattr(observations, "signed_distance_frames", frames)
+    with pytest.raises(RuntimeError, match="in the middle"):
+        _observed(balls, Run(cache=tmp_path), pool=False, ballistic=False)
+    assert not there
+    assert [path.name[:6] for path in sorted(tmp_path.iterdir()) if path.suffix != ".lock"] == ["bounds"]
+
+
+def test_progress_never_goes_back(balls: Scene, tmp_path: Path) -> None:
+    for run in (Run(cache=tmp_path), Run(cache=tmp_path), Run()):
+        told: list[float] = []
+        config = SplashSplatConfig.model_validate(SMALL)
+        for _ in Observations(balls.training(), config, run, lambda done, message, told=told: told.append(done)):
+            pass
+        assert told == sorted(told)
+        assert told[-1] == 1

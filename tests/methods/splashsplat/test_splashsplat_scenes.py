@@ -1,0 +1,167 @@
+"""SplashSplat on scenes that lack something: liquid, frames, views, gravity. A right result, or one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Run
+from splashbench.scene import Camera, Scene
+from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat.appearance.occlusion import Occlusion
+from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid
+
+TINY = {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 12}
+
+
+class Grey:
+    """In place of a background, which would take most of the time."""
+
+    def render(self, camera: Camera) -> np.ndarray:
+        return np.full((camera.height, camera.width, 3), 0.5, np.float32)
+
+
+def as_fitted(liquid: Liquid, occlusion: Occlusion | None) -> FittedSplashSplat:
+    return FittedSplashSplat(liquid, Grey(), occlusion)
+
+
+def fit(directory: Path, preset: str = "quick", **settings: object) -> FittedSplashSplat:
+    config = SplashSplatConfig.preset(preset, TINY | settings)
+    scene = Scene.open(directory).training()
+    images = {name: Grey().render(camera) for name, camera in scene.cameras.items()}
+    return as_fitted(*fit_liquid(scene, images, config, Run(seed=0)))
+
+
+def set_masks(directory: Path, value: int, cameras: tuple[str, ...], frames: range) -> None:
+    scene = Scene.open(directory)
+    for camera in cameras:
+        for t in frames:
+            path = scene.mask_path(camera, t)
+            size = scene.cameras[camera].width, scene.cameras[camera].height
+            path.unlink()
+            Image.new("L", size, value).save(path)
+
+
+def cut(directory: Path, frames: int, train: tuple[str, ...] | None = None) -> None:
+    """Only the first `frames` frames, and only the training views `train`."""
+    for name in ("train_meta.json", "test_meta.json"):
+        path = directory / name
+        meta = json.loads(path.read_text())
+        names = [entry.split("/")[0] for entry in meta["fn"][0]]
+        kept = [n for n, camera in enumerate(names) if name[:2] == "te" or train is None or camera in train]
+        for key in ("k", "w2c", "fn"):
+            meta[key] = [[row[n] for n in kept] for row in meta[key][:frames]]
+        path.write_text(json.dumps(meta))
+    path = directory / "scene.json"
+    meta = json.loads(path.read_text())
+    meta["times"] = meta["times"][:frames]
+    if train is not None:
+        meta["sizes"] = {name: size for name, size in meta["sizes"].items() if name in (*train, "6", "7")}
+    path.write_text(json.dumps(meta))
+
+
+def change(directory: Path, **fields: object) -> None:
+    path = directory / "scene.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def carriers(fitted: FittedSplashSplat) -> list[int]:
+    return np.diff(fitted.liquid.carriers.starts).tolist()
+
+
+def rendered(fitted: FittedSplashSplat, directory: Path, t: int) -> np.ndarray:
+    scene = Scene.open(directory)
+    return fitted.render(scene.cameras["6"], float(scene.times[t])).alpha
+
+
+def test_frames_without_liquid_have_no_carriers_and_draw_nothing(balls_copy: Path):
+    set_masks(balls_copy, 0, ("1", "2", "3", "4", "5"), range(2, 4))
+    fitted = fit(balls_copy)
+    counts = carriers(fitted)
+    assert [count == 0 for count in counts] == [t in (2, 3) for t in range(len(counts))]
+    assert rendered(fitted, balls_copy, 2).max() == 0
+    assert rendered(fitted, balls_copy, 5).max() > 0
+
+
+def test_a_scene_without_any_liquid_is_not_supported(balls_copy: Path):
+    set_masks(balls_copy, 0, ("1", "2", "3", "4", "5"), range(8))
+    support = SplashSplat().supports(Scene.open(balls_copy).training())
+    assert not support.ok
+    assert "masks" in support.reason
+
+
+def test_one_frame_is_a_still(balls_copy: Path):
+    cut(balls_copy, 1)
+    fitted = fit(balls_copy)
+    assert carriers(fitted)[0] > 50
+    particles = fitted.particles()
+    assert particles.positions.shape[0] == 1
+    assert rendered(fitted, balls_copy, 0).max() > 0
+
+
+@pytest.mark.parametrize("variant", ["no_resampling", "per_frame", "flip"])
+def test_every_variant_takes_one_frame(balls_copy: Path, variant: str):
+    cut(balls_copy, 1)
+    assert carriers(fit(balls_copy, variant=variant))[0] > 50
+
+
+def test_masks_that_are_all_full_are_refused_in_one_line(balls_copy: Path):
+    set_masks(balls_copy, 255, ("1", "2", "3", "4", "5"), range(8))
+    with pytest.raises(SplashbenchError) as raised:
+        fit(balls_copy)
+    assert "\n" not in str(raised.value)
+    assert "mask" in str(raised.value)
+
+
+def test_a_camera_that_never_sees_the_liquid_does_not_matter(balls_copy: Path):
+    set_masks(balls_copy, 0, ("3",), range(8))
+    assert min(carriers(fit(balls_copy))) > 0
+
+
+def test_two_training_views_are_enough(balls_copy: Path):
+    cut(balls_copy, 3, ("1", "4"))
+    assert min(carriers(fit(balls_copy))) > 0
+
+
+def test_without_gravity_the_best_preset_leaves_out_what_needs_it(balls_copy: Path):
+    cut(balls_copy, 3)
+    change(balls_copy, gravity=None, metres_per_unit=None)
+    assert min(carriers(fit(balls_copy, "best"))) > 0
+
+
+def test_flip_without_gravity_says_what_is_missing(balls_copy: Path):
+    cut(balls_copy, 2)
+    change(balls_copy, gravity=None)
+    with pytest.raises(SplashbenchError, match=r"gravity.*scene\.json"):
+        fit(balls_copy, variant="flip")
+
+
+def test_flip_keeps_the_first_carriers_only_and_moves_them_by_gravity(balls_copy: Path):
+    cut(balls_copy, 4)
+    fitted = fit(balls_copy, variant="flip")
+    births, _ = fitted.liquid.carriers.births_and_ends()
+    assert (births == 0).all()
+    counts = carriers(fitted)
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_a_saved_container_that_is_broken_is_named(tmp_path: Path):
+    faces = np.array([[0, 1, 9]])
+    np.savez_compressed(tmp_path / "container.npz", vertices=np.eye(3), faces=faces, tolerance=np.ones(1))
+    with pytest.raises(SplashbenchError, match=r"container\.npz"):
+        Occlusion.load(tmp_path)
+
+
+def test_stages_of_the_fit_are_told(balls_copy: Path):
+    cut(balls_copy, 2)
+    run = Run(seed=0)
+    config = SplashSplatConfig.preset("quick", TINY | {"background_preset": "quick"})
+    SplashSplat().fit(Scene.open(balls_copy).training(), config, run)
+    assert {"background", "signed distance", "velocity", "carriers", "appearance"} <= set(run.stages)
+    assert min(run.stages.values()) >= 0

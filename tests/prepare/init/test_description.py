@@ -1,0 +1,205 @@
+"""`prepare --init`: whose recording of what, from names and from looking; the board; what is left to a person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from splashbench import toml
+from splashbench.cli.main import main
+from splashbench.errors import SplashbenchError
+from splashbench.prepare.init.board_guess import guess_board
+from splashbench.prepare.init.description import describe
+from splashbench.prepare.init.discovery import Film, find_films
+from splashbench.prepare.init.inspection import Look, MarkerFinder, assign, look_at
+
+BOARD = cv2.aruco.CharucoBoard((8, 5), 0.03, 0.0225, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50))
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
+def write_clip(path: Path, images: list[np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "10", "preset": "ultrafast"})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode(None):
+            container.mux(packet)
+
+
+def scenery(width: int = 320, height: int = 180, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(40, 200, (height // 12, width // 12, 3)).astype(np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def with_board(tilt: float, shift: float, legacy_board: cv2.aruco.CharucoBoard = BOARD) -> np.ndarray:
+    """The board in a 640x360 picture, tilted and shifted."""
+    print_ = cv2.cvtColor(legacy_board.generateImage((640, 400), marginSize=20), cv2.COLOR_GRAY2RGB)
+    corners = np.float32([[0, 0], [640, 0], [640, 400], [0, 400]])
+    seen = np.float32([[100, 60], [470, 60 + 60 * tilt], [470, 300 - 60 * tilt], [100, 300]]) + np.float32([shift, 0])
+    homography = cv2.getPerspectiveTransform(corners, seen)
+    return cv2.warpPerspective(print_, homography, (640, 360), dst=scenery(640, 360), borderMode=cv2.BORDER_TRANSPARENT)
+
+
+def test_a_folder_per_camera_and_subject(tmp_path: Path) -> None:
+    touch(
+        tmp_path,
+        "cameras/10/pour/GX020003.MP4",
+        "cameras/10/pour/GX010003.MP4",
+        "cameras/10/intrinsics/GX010001.MP4",
+        "cameras/2/static/GX010002.MP4",
+        "sweep/GX010001.MP4",
+        "cameras/2/pour/GL010003.LRV",
+        "truth/pour.mp4",
+        ".trash/pour.mp4",
+    )
+    assert find_films(tmp_path) == [
+        Film(("sweep/GX010001.MP4",), "", "sweep"),
+        Film(("cameras/2/static/GX010002.MP4",), "2", "static"),
+        Film(("cameras/10/intrinsics/GX010001.MP4",), "10", "intrinsics"),
+        Film(("cameras/10/pour/GX010003.MP4", "cameras/10/pour/GX020003.MP4"), "10", "pour"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "camera", "filmed", "chapters"),
+    [
+        (("cam1_GX010007.MP4", "cam1_GX020007.MP4"), "cam1", None, 2),
+        (("left/DCIM/100GOPRO/GOPR0004.MP4", "left/DCIM/100GOPRO/GP010004.MP4"), "left", None, 2),
+        (("pour/cam-3.mov",), "cam_3", "pour", 1),
+        (("cam3_pour.mp4",), "cam3", "pour", 1),
+        (("3/calibration.MOV",), "3", "intrinsics", 1),
+        (("GH010001.MP4",), "", None, 1),
+        (("take 2/cam 1/GX010004.MP4",), "cam_1", None, 1),
+        (("cam1/pour 2/GX010004.MP4",), "cam1", "pour", 1),
+    ],
+)
+def test_ways_to_name_files(
+    tmp_path: Path, names: tuple[str, ...], camera: str, filmed: str | None, chapters: int
+) -> None:
+    touch(tmp_path, *names)
+    (film,) = find_films(tmp_path)
+    assert (film.camera, film.filmed, len(film.files)) == (camera, filmed, chapters)
+    assert film.files == names
+
+
+def test_no_film_is_one_line(tmp_path: Path) -> None:
+    touch(tmp_path, "notes.txt")
+    with pytest.raises(SplashbenchError, match="no film in it"):
+        find_films(tmp_path)
+
+
+def film(name: str, filmed: str | None = None) -> Film:
+    return Film((name,), "1", filmed)
+
+
+def test_what_films_show_is_told_from_looks() -> None:
+    looks = {
+        ("a",): Look(seconds=20, marker_share=0.9, marker_travel=0.4, change=25, shift=0.01),
+        ("b",): Look(seconds=5, marker_share=1.0, marker_travel=0.0, change=0.5, shift=0.0),
+        ("c",): Look(seconds=60, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
+        ("d",): Look(seconds=30, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
+    }
+    shown = {f.files[0]: f.filmed for f in assign([film(name) for name in "dcba"], looks)}
+    assert shown == {"a": "intrinsics", "b": "static", "c": "pour", "d": None}
+    # Names outweigh looks.
+    shown = {f.files[0]: f.filmed for f in assign([film("c", "static"), film("d"), film("a")], looks)}
+    assert shown == {"c": "static", "d": "pour", "a": "intrinsics"}
+    moving = {("s",): Look(seconds=40, marker_share=0.4, marker_travel=0.5, change=30, shift=0.1)}
+    assert assign([film("s")], moving)[0].filmed == "sweep"
+
+
+def test_looks_tell_rest_board_and_travel(tmp_path: Path) -> None:
+    still = scenery(320, 180)
+    write_clip(tmp_path / "still.mp4", [still] * 12)
+    wide = scenery(960, 180)
+    write_clip(tmp_path / "sweep.mp4", [np.ascontiguousarray(wide[:, 20 * k : 20 * k + 320]) for k in range(12)])
+    write_clip(tmp_path / "board.mp4", [with_board(0.3, 12.0 * k) for k in range(12)])
+    rest, travel, board = (look_at([tmp_path / f"{name}.mp4"], MarkerFinder()) for name in ("still", "sweep", "board"))
+    assert (rest.marker_share, rest.change < 2, rest.shift < 0.005) == (0, True, True)
+    assert travel.shift > 0.03
+    assert board.marker_share == 1
+    assert board.marker_travel > 0.1
+
+
+@pytest.mark.parametrize(("legacy", "inverted"), [(False, False), (False, True), (True, False)])
+def test_the_board_is_recognised(legacy: bool, inverted: bool) -> None:
+    board = cv2.aruco.CharucoBoard((7, 6), 0.03, 0.02, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50))
+    board.setLegacyPattern(legacy)
+    images = [cv2.cvtColor(with_board(0.1 * k, 5.0 * k, board), cv2.COLOR_RGB2GRAY) for k in range(5)]
+    found = guess_board([255 - image for image in images] if inverted else images)
+    assert found is not None
+    assert (found.squares_x, found.squares_y, found.dictionary) == (7, 6, "DICT_5X5_50")
+    assert (found.legacy, found.inverted) == (legacy, inverted)
+    assert found.marker_share == pytest.approx(2 / 3, abs=0.04)
+
+
+def test_no_board_no_guess() -> None:
+    assert guess_board([cv2.cvtColor(scenery(640, 360, seed), cv2.COLOR_RGB2GRAY) for seed in range(4)]) is None
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    session = tmp_path / "monday"
+    for camera in ("cam1", "cam2", "cam3"):
+        write_clip(session / camera / "intrinsics/GX010001.MP4", [with_board(0.2, 10.0 * k) for k in range(5)])
+        write_clip(session / camera / "static/GX010002.MP4", [scenery()] * 5)
+        write_clip(session / camera / "GX010003.MP4", [scenery(seed=k) for k in range(6)])
+    return session
+
+
+def test_a_session_is_described(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["prepare", str(folder), "--init", "--square-metres", "0.03"]) == 0
+    described = toml.load(folder / "session.toml")
+    assert (described["train"], described["test"]) == (["cam1", "cam2"], ["cam3"])
+    assert (described["board"]["squares_x"], described["board"]["squares_y"]) == (8, 5)
+    assert described["board"]["marker_metres"] == pytest.approx(0.0225, rel=0.06)
+    assert described["recordings"]["pour"]["cam2"] == ["cam2/GX010003.MP4"]
+    assert "no handheld sweep" in capsys.readouterr().err
+    # It is a session: what prepare finds wanting is in the films, not in their description.
+    assert main(["prepare", str(folder), str(folder.parent / "scene")]) == 1
+    assert "has no audio track" in capsys.readouterr().err
+    assert main(["prepare", str(folder), "--init"]) == 1
+    assert "exists already; edit it" in capsys.readouterr().err
+
+
+def test_what_cannot_be_seen_is_left_to_a_person(folder: Path) -> None:
+    (folder / "cam3/static/GX010002.MP4").unlink()
+    found = describe(folder)
+    assert any("measure one printed square" in line for line in found.to_do)
+    assert any("no static recording was told for camera cam3" in line for line in found.to_do)
+    with pytest.raises(SplashbenchError, match=r"session\.toml: board\.square_metres: Field required"):
+        from splashbench.prepare.session import Session
+
+        Session.open(folder)
+
+
+def test_one_camera_is_no_session(tmp_path: Path) -> None:
+    write_clip(tmp_path / "GX010003.MP4", [scenery(seed=k) for k in range(6)])
+    with pytest.raises(SplashbenchError, match="put every camera's files into a folder of its name"):
+        describe(tmp_path)
+    assert not (tmp_path / "session.toml").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--init", "scene"], ["--square-metres", "0.03", "scene"], [], ["--init", "--square-metres", "wide"]],
+)
+def test_wrong_usage(tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["prepare", str(tmp_path), *arguments])
+    assert stopped.value.code == 2
+    assert "prepare" in capsys.readouterr().err
