@@ -1,7 +1,7 @@
 """The container's surface from the footage itself, where nobody has scanned it.
 
 An opaque container hides liquid from the views behind its wall. Carving away what such a view does not show is the
-largest single error of a hull. To know what is hidden takes no scan, only the depth of the wall. The clean plates' depths
+largest single error of a hull. To know what is hidden takes no scan, only the depth of the wall. The plates' depths
 (splashbench/background) are fused on a grid within the container masks, as a truncated signed distance (Curless and
 Levoy 1996). For each view a node in front of the depth is free, one a little behind it is not, and the mean over views
 decides. A node outside a mask is free. A node is dropped unless two views agree on its depth.

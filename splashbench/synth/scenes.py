@@ -1,7 +1,7 @@
 """Synthetic scenes: a simulated liquid seen by seven perfect pinhole cameras on one clock, with exact ground truth.
 
-A session (`splashbench.synth.recording.session`) also tests the preparation; a scene isolates the methods. Nothing about
-calibration, synchronisation or masks is wrong. Scene units are metres, y points up.
+A session (`splashbench.synth.recording.session`) also tests the preparation; a scene isolates the methods. Nothing
+about calibration, synchronisation or masks is wrong. Scene units are metres, y points up.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import pytest
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_image
-from splashbench.score.image.fidelity import lpips as module
+from splashbench.score.image import lpips as module
 from splashbench.score.image.lpips import Lpips, load_lpips
 
 
