@@ -68,7 +68,7 @@ def measure(
         "stages": stages,
         "peak_memory_bytes": record.peak_memory_bytes,
         "storage_bytes": record.storage_bytes,
-        "carriers_per_frame": record.carriers_per_frame,
+        "particles_per_frame": record.particles_per_frame,
         "load_average": load,
     }
 

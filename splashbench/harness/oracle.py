@@ -43,7 +43,7 @@ def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
             hardware=hardware.describe(),
         )
         carriers = float(particles.active.sum(axis=1).mean()) if particles is not None else None
-        seal(staging, identity, Record(carriers_per_frame=carriers))
+        seal(staging, identity, Record(particles_per_frame=carriers))
     return Submission.open(out)
 
 

@@ -195,12 +195,12 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
             "render_fps": outcome.render_fps,
             "timed_frames": outcome.timed_frames,
             "primitives_per_frame": outcome.primitives_per_frame,
-            "carriers_per_frame": carriers_per_frame(staging),
+            "particles_per_frame": particles_per_frame(staging),
         }
     )
 
 
-def carriers_per_frame(staging: Path) -> float | None:
+def particles_per_frame(staging: Path) -> float | None:
     """Mean number of active particles in particles.npz, where there is one."""
     path = staging / "particles.npz"
     return float(Particles.load(path).active.sum(axis=1).mean()) if path.is_file() else None

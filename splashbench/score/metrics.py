@@ -42,7 +42,7 @@ class Metric:
 
         The filter is no part of the method (observe/consistency.py), so tables and charts mark such figures.
         """
-        return self.group in ("particles", "truth") or self.name in ("spill", "miou", "carriers_per_frame")
+        return self.group in ("particles", "truth") or self.name in ("spill", "miou", "particles_per_frame")
 
     @property
     def label(self) -> str:
@@ -78,7 +78,7 @@ METRICS: dict[str, Metric] = {
         Metric("storage_bytes", "Storage", "B", "lower", 0, _HERE, "cost"),
         Metric("dynamic_bytes", "Dynamic storage", "B", "lower", 0, _HERE, "cost"),
         Metric("primitives_per_frame", "Primitives per frame", "", None, 0, _HERE, "cost"),
-        Metric("carriers_per_frame", "Carriers per frame", "", None, 0, _HERE, "cost"),
+        Metric("particles_per_frame", "Particles per frame", "", None, 0, _HERE, "cost"),
         Metric("surface_chamfer", "Chamfer", "voxels", "lower", 3, _HERE, "truth"),
         Metric("sdf_iou", "Volume IoU", "", "higher", 4, _HERE, "truth"),
         Metric("sdf_recall", "Volume recall", "", "higher", 4, _HERE, "truth"),

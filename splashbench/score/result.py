@@ -11,11 +11,12 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from splashbench.files import read_model, write_model
 from splashbench.score.metrics import METRICS, Better
 from splashbench.score.settings import Protocol
+from splashbench.submission import with_current_names
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.+-]+")
 
@@ -81,6 +82,11 @@ class Result(_Frozen):
     hardware: dict[str, Any] = Field(default_factory=dict)
     times_source: str = ""
     versions: dict[str, str] = Field(default_factory=dict)
+
+    @field_validator("metrics", "claimed", mode="before")
+    @classmethod
+    def _current_names(cls, value: Any) -> Any:
+        return with_current_names(value)
 
     def value(self, name: str) -> float | None:
         """The value of metric `name`, or None."""

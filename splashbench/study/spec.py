@@ -18,6 +18,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import validate_model
 from splashbench.score.metrics import METRICS, Metric
 from splashbench.study.perturbation import Perturbation
+from splashbench.submission import RENAMED_FIGURES
 from splashbench.submission.withheld import Withheld
 
 #: Metrics that follow from others, tabulated here alone: sigma_D over mu_D is what the paper's Table S7 gives.
@@ -114,6 +115,8 @@ class StudySpec(_Model):
     def _known_metrics(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         known = [*METRICS, *DERIVED]
         for name in value:
+            if name in RENAMED_FIGURES:
+                raise ValueError(f"metric {name!r} is called {RENAMED_FIGURES[name]!r} now; change the name")
             if name not in known:
                 raise ValueError(f"there is no metric {name!r}{_near(name, known)}")
         return value

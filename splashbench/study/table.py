@@ -29,7 +29,7 @@ _PAPER_COLUMNS = {
     "sigma_mu_ratio": ("sigma_mu_ratio", 1.0),
     "delta_e": ("delta_e", 1.0),
     "miou": ("miou", 1.0),
-    "carriers_per_frame": ("carriers", 1.0),
+    "particles_per_frame": ("carriers", 1.0),
     "primitives_per_frame": ("gaussians_per_frame", 1.0),
     "dynamic_bytes": ("dynamic_storage_mb", 1e6),
     "storage_bytes": ("storage_mb", 1e6),

@@ -1,6 +1,6 @@
 """Submissions: what a method hands in. Writing, reading and checking them."""
 
-from splashbench.submission.identity import PROTOCOL, Identity, Record, Status
+from splashbench.submission.identity import PROTOCOL, RENAMED_FIGURES, Identity, Record, Status, with_current_names
 from splashbench.submission.submission import (
     IDENTITY,
     Submission,
@@ -14,6 +14,7 @@ from splashbench.submission.submission import (
 __all__ = [
     "IDENTITY",
     "PROTOCOL",
+    "RENAMED_FIGURES",
     "Identity",
     "Record",
     "Status",
@@ -22,5 +23,6 @@ __all__ = [
     "identity_text",
     "seal",
     "to_8bit",
+    "with_current_names",
     "write_view",
 ]

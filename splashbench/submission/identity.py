@@ -5,16 +5,24 @@ from __future__ import annotations
 from enum import Enum
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from splashbench.submission.withheld import Withheld
 
 PROTOCOL: Literal["v1"] = "v1"
 _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 
-
 #: No cost of a run comes near; anything beyond is no measurement (and infinity is none either).
-_MOST = 10**15
+_MAX_COST = 10**15
+#: Figures by the names that records and results had before version 0.2 -> today's names.
+RENAMED_FIGURES = {"carriers_per_frame": "particles_per_frame"}
+
+
+def with_current_names(figures: Any) -> Any:
+    """`figures` as read from a file, with keys of `RENAMED_FIGURES` replaced: old files stay readable."""
+    if not isinstance(figures, dict):
+        return figures
+    return {RENAMED_FIGURES.get(name, name): value for name, value in figures.items()}
 
 
 class Status(str, Enum):
@@ -54,6 +62,11 @@ class Identity(BaseModel):
     #: What the submitter says the figures are; shown beside the verified ones, never instead of them.
     claimed: dict[str, float] = Field(default_factory=dict)
 
+    @field_validator("claimed", mode="before")
+    @classmethod
+    def _current_names(cls, value: Any) -> Any:
+        return with_current_names(value)
+
 
 class Record(BaseModel):
     """record.json: status and costs, as the harness measured them; null is not measured."""
@@ -62,18 +75,23 @@ class Record(BaseModel):
     schema_version: Literal[1] = 1
     status: Status = Status.OK
     reason: str = ""
-    fit_seconds: float | None = Field(default=None, ge=0, le=_MOST)
+    fit_seconds: float | None = Field(default=None, ge=0, le=_MAX_COST)
     #: parts that were loaded from an earlier run, and the seconds of their fit there, which fit_seconds includes
-    reused: dict[str, Annotated[float, Field(ge=0, le=_MOST)]] = Field(default_factory=dict)
+    reused: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
     #: seconds of the fit's stages, where the method tells them
-    stages: dict[str, Annotated[float, Field(ge=0, le=_MOST)]] = Field(default_factory=dict)
-    render_fps: float | None = Field(default=None, ge=0, le=_MOST)
+    stages: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
+    render_fps: float | None = Field(default=None, ge=0, le=_MAX_COST)
     timed_frames: int | None = Field(default=None, ge=0)
-    peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MOST)
-    peak_device_memory_bytes: int | None = Field(default=None, ge=0, le=_MOST)
-    storage_bytes: int | None = Field(default=None, ge=0, le=_MOST)
-    dynamic_bytes: int | None = Field(default=None, ge=0, le=_MOST)
-    primitives_per_frame: float | None = Field(default=None, ge=0, le=_MOST)
-    carriers_per_frame: float | None = Field(default=None, ge=0, le=_MOST)
+    peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
+    peak_device_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
+    storage_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
+    dynamic_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
+    primitives_per_frame: float | None = Field(default=None, ge=0, le=_MAX_COST)
+    particles_per_frame: float | None = Field(default=None, ge=0, le=_MAX_COST)
     renderer: list[str] = Field(default_factory=list)  # backends of the shared renderer, such as "cpu (avx2)"
     log_tail: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _current_names(cls, data: Any) -> Any:
+        return with_current_names(data)

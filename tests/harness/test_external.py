@@ -73,7 +73,7 @@ def test_a_good_code_is_measured_checked_and_scored(
     assert record.fit_seconds > 0
     assert record.peak_memory_bytes is not None
     assert record.peak_memory_bytes > 1 << 20
-    assert record.carriers_per_frame == 2
+    assert record.particles_per_frame == 2
     assert record.render_fps is None
     model = read_json(out / "model" / "model.json")
     assert model["arguments"] == ["4", "cuda:1", "8", str(float(balls.times[-1] - balls.times[0])), "a b"]

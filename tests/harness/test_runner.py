@@ -33,7 +33,7 @@ def test_a_good_method_is_measured_and_whole(balls_directory: Path, balls: Scene
     assert record.peak_memory_bytes > 1 << 20
     assert record.render_fps is not None
     assert record.render_fps > 0
-    assert record.carriers_per_frame == 2
+    assert record.particles_per_frame == 2
     # 1000 bytes of static background and the three of "1.0".
     assert (record.storage_bytes, record.dynamic_bytes) == (1003, 3)
     assert check_submission(tmp_path / "out", balls) == []

@@ -39,7 +39,7 @@ def results(make_result: Any) -> list[Any]:
 def test_what_rests_on_the_filter() -> None:
     marked = {name for name, metric in METRICS.items() if filter_mark(metric, True, 1.0)}
     assert {"miou", "spill", "sigma_d", "mu_d", "uniformity", "delta_e", "sdf_iou", "velocity_epe"} < marked
-    assert "carriers_per_frame" in marked
+    assert "particles_per_frame" in marked
     assert marked.isdisjoint(
         {"psnr", "dpsnr_bg", "ssim", "ssim_fg", "lpips", "spill_rgb", "jitter_error", "fit_seconds"}
     )

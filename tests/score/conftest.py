@@ -13,7 +13,7 @@ import pytest
 from splashbench.scene import Particles, Scene, SignedDistance
 
 _COSTS = ("fit_seconds", "render_fps", "peak_memory_bytes", "peak_device_memory_bytes", "storage_bytes")
-_COSTS += ("dynamic_bytes", "primitives_per_frame", "carriers_per_frame")
+_COSTS += ("dynamic_bytes", "primitives_per_frame", "particles_per_frame")
 
 
 @dataclass

@@ -19,7 +19,7 @@ NAMES = [
     *("psnr", "dpsnr_bg", "ssim", "ssim_fg", "lpips", "spill", "spill_rgb", "jitter_error"),
     *("sigma_d", "mu_d", "uniformity", "delta_e", "miou", "fit_seconds", "render_fps"),
     *("peak_memory_bytes", "peak_device_memory_bytes", "storage_bytes", "dynamic_bytes"),
-    *("primitives_per_frame", "carriers_per_frame"),
+    *("primitives_per_frame", "particles_per_frame"),
     *("surface_chamfer", "sdf_iou", "sdf_recall", "sdf_precision"),
     *("velocity_epe", "velocity_epe_relative", "airborne_epe_relative", "velocity_coverage"),
 ]
@@ -38,6 +38,16 @@ def test_the_oracle_is_perfect(balls: Scene, tmp_path: Path, quiet: Any) -> None
     }
     assert {name: result.value(name) for name in expected} == expected
     assert result.control
+
+
+def test_a_result_with_figures_under_their_old_names_is_still_read(
+    balls: Scene, fake: Any, tmp_path: Path, quiet: Any
+) -> None:
+    result = score_submission(balls, fake(balls), track=quiet)
+    path = result.save(tmp_path)
+    path.write_text(path.read_text().replace('"particles_per_frame"', '"carriers_per_frame"'))
+    assert '"carriers_per_frame"' in path.read_text()
+    assert Result.load(path) == result
 
 
 def test_the_oracle_has_no_perceptual_distance(balls: Scene, fake: Any, quiet: Any, test_data: Path) -> None:

@@ -35,7 +35,7 @@ def _spec(scene: Path, **changes: Any) -> dict[str, Any]:
         "method": METHOD,
         "seeds": [0, 1],
         "scenes": [str(scene)],
-        "metrics": ["psnr", "carriers_per_frame", "fit_seconds"],
+        "metrics": ["psnr", "particles_per_frame", "fit_seconds"],
         "baseline": "full",
         "reference": False,
         "variants": [{"name": "full"}, {"name": "dark", "settings": {"grey": 0.1}}],
@@ -84,8 +84,8 @@ def test_every_variant_is_run_and_scored(study: tuple[str, Path, Path], balls: S
     ]
     # The method makes a particle of every hundred pixels of liquid that it saw.
     seen = sum(int(balls.mask(name, t).sum()) for name in balls.train for t in range(balls.n_frames))
-    assert rows["full"]["figures"]["carriers_per_frame"]["mean"] == seen // 100
-    assert rows["raw"]["figures"]["carriers_per_frame"]["mean"] == pytest.approx(0.6 * seen / 100, rel=0.15)
+    assert rows["full"]["figures"]["particles_per_frame"]["mean"] == seen // 100
+    assert rows["raw"]["figures"]["particles_per_frame"]["mean"] == pytest.approx(0.6 * seen / 100, rel=0.15)
     assert "this seed does not work" in (out / "table.md").read_text()
     # Two rows that come to the same share their runs: three fits for each seed.
     assert len(_fits(log)) == 6
@@ -217,6 +217,7 @@ def _raising(arguments: list[str]) -> None:
         ({"scenes": ["nowhere"]}, [], "nowhere is not a folder"),
         ({"scenes": []}, [], "names no scenes; give some with --scenes"),
         ({"metrics": ["pnsr"]}, [], "there is no metric 'pnsr', did you mean 'psnr'?"),
+        ({"metrics": ["carriers_per_frame"]}, [], "'carriers_per_frame' is called 'particles_per_frame' now"),
         ({"baseline": "ful"}, [], "baseline 'ful' is no variant, did you mean 'full'?"),
         ({"seed": [1]}, [], "greys.toml: seed: Extra inputs are not permitted"),
         ({"seeds": [1, 1]}, [], "seed 1 is listed twice"),

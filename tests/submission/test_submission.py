@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
 from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Scene
-from splashbench.submission import Submission, check_submission, to_8bit
+from splashbench.submission import Identity, Record, Submission, check_submission, to_8bit
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,14 @@ def test_identity_from_a_stranger_is_validated(copy: Path) -> None:
     path.write_text(path.read_text().replace('method = "oracle"', 'method = "../../etc"'))
     with pytest.raises(SplashbenchError, match=r"submission.toml: method"):
         Submission.open(copy, verify=False)
+
+
+def test_figures_under_their_old_names_are_still_read() -> None:
+    assert Record.model_validate_json('{"carriers_per_frame": 12.5}').particles_per_frame == 12.5
+    claims = Identity(method="a", scene="b", scene_digest="0" * 64, claimed={"carriers_per_frame": 3.0, "psnr": 20.0})
+    assert claims.claimed == {"particles_per_frame": 3.0, "psnr": 20.0}
+    with pytest.raises(ValidationError, match="a list"):
+        Record.model_validate(["a list"])
 
 
 def test_eight_bits_round_and_clip() -> None:

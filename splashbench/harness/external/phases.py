@@ -16,7 +16,7 @@ from splashbench.harness.external.collection import collect
 from splashbench.harness.external.commands import command_line
 from splashbench.harness.messages import Failure, Request
 from splashbench.harness.process import Watched, watch
-from splashbench.harness.runner import carriers_per_frame, run_phase
+from splashbench.harness.runner import particles_per_frame, run_phase
 from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Scene
 from splashbench.scene.exporting import TEST_VIEWS, export_scene
@@ -141,7 +141,7 @@ class ExternalRun:
         collect(self.into, self.staging, self.scene)
         if keep_model:
             _copy_plain(self.output, self.staging / "model")
-        self._note(carriers_per_frame=carriers_per_frame(self.staging))
+        self._note(particles_per_frame=particles_per_frame(self.staging))
 
     def import_model(self, timing_frames: int, exr: bool) -> None:
         """Read the output by the importer and render it as a method's model: checked, timed, counted."""
@@ -179,7 +179,7 @@ class ExternalRun:
             render_fps=outcome.render_fps,
             timed_frames=outcome.timed_frames,
             primitives_per_frame=outcome.primitives_per_frame,
-            carriers_per_frame=carriers_per_frame(self.staging),
+            particles_per_frame=particles_per_frame(self.staging),
             renderer=outcome.renderer,
             **_storage(model),
         )
