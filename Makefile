@@ -15,8 +15,9 @@ SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13)
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-all lint wheel kernel sanitize clean
 
-# The renderer's kernel, and what builds it: where one of them changes, it is built and installed anew.
-KERNEL := setup.py build_kernel.py $(wildcard splashbench/render/kernel/*.cpp splashbench/render/kernel/*.h)
+# The compiled kernels, and what builds them: where one of these changes, they are built and installed anew.
+KERNEL_FOLDERS := splashbench/native splashbench/*/kernel methods/*/kernel
+KERNEL := setup.py build_kernel.py build_compilers.py $(wildcard $(foreach folder,$(KERNEL_FOLDERS),$(folder)/*.cpp $(folder)/*.h))
 
 help:
 	@echo "make demo      film a made-up pour, reconstruct it and score it, into demo_output/"
@@ -24,8 +25,8 @@ help:
 	@echo "make test-all  run every test (those without a CUDA device to run on skip)"
 	@echo "make lint      check style and types"
 	@echo "make wheel     build the wheel into dist/"
-	@echo "make kernel    build the renderer's kernel in place, after an edit"
-	@echo "make sanitize  run the renderer's tests under AddressSanitizer and UndefinedBehaviorSanitizer (needs g++)"
+	@echo "make kernel    build the compiled kernels in place, after an edit"
+	@echo "make sanitize  run the kernels' tests under AddressSanitizer and UndefinedBehaviorSanitizer (needs g++)"
 	@echo "make clean     remove everything the targets above made, .venv included"
 
 demo: .venv/installed-synth
@@ -57,17 +58,17 @@ kernel: .venv/ready
 # Python itself is not built with the sanitizers, so their libraries are loaded before it; and before the C++ library,
 # whose exceptions they watch. What Python leaves unfreed at its end is no leak of ours.
 SANITIZE_CXX ?= g++
-SANITIZE_VARIANT ?= $(if $(filter aarch64 arm64,$(shell uname -m)),neon,avx2)
+SANITIZE_VARIANT ?= avx2
 sanitize: .venv/installed-test
 	SPLASHBENCH_CXX=$(SANITIZE_CXX) $(BIN)/python build_kernel.py --sanitize --variant $(SANITIZE_VARIANT) --output build/sanitized
-	@echo "==> Running the renderer's tests under the sanitizers"
+	@echo "==> Running the kernels' tests under the sanitizers"
 	LD_PRELOAD="$$(for name in asan ubsan stdc++; do $(SANITIZE_CXX) -print-file-name=lib$$name.so; done | tr '\n' ' ')" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
-	SPLASHBENCH_KERNEL="$(CURDIR)/build/sanitized/libsplash_$(SANITIZE_VARIANT).so" \
-	$(BIN)/python -m pytest -q -m "not slow and not cuda" tests/render
+	SPLASHBENCH_KERNEL="$(CURDIR)/build/sanitized" SPLASHBENCH_SIMD=$(SANITIZE_VARIANT) \
+	$(BIN)/python -m pytest -q -m "not slow and not cuda" tests/native tests/render tests/methods/splashsplat/test_kernel_*.py
 
 clean:
-	rm -rf .venv build dist demo_output *.egg-info .pytest_cache .mypy_cache .ruff_cache splashbench/render/kernel/libsplash_*
+	rm -rf .venv build dist demo_output *.egg-info .pytest_cache .mypy_cache .ruff_cache splashbench/*/kernel/lib*.so methods/*/kernel/lib*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One call of pip for each set of optional packages, repeated only when what it would install may have changed.

@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the renderer's kernel is built along, and a wheel fits every Python 3 on a platform.
+"""What pyproject.toml cannot say: compiled kernels are built along, and a wheel fits every Python 3 on its platform.
 
 The compiling itself, and why it is done so, is in build_kernel.py.
 """
@@ -14,20 +14,22 @@ from setuptools.command.bdist_wheel import bdist_wheel  # type: ignore[import-un
 from setuptools.command.build_ext import build_ext  # type: ignore[import-untyped]
 from setuptools.errors import CompileError  # type: ignore[import-untyped]
 
+import build_compilers
 import build_kernel
-from build_kernel import KernelBuildError
+from build_compilers import KernelBuildError
 
 try:
-    TARGET = build_kernel.this_target()
+    build_compilers.check_platform()
+    KERNELS = build_kernel.kernels()
 except KernelBuildError as error:
     raise SystemExit(f"error: {error}") from None
 
 
 @functools.cache
-def compiler() -> build_kernel.Compiler:
+def compiler() -> build_compilers.Compiler:
     """The compiler of this build, looked for when it is needed: not when pip asks for the metadata."""
     try:
-        return build_kernel.installed_compiler(TARGET, os.environ)
+        return build_compilers.installed_compiler(os.environ)
     except KernelBuildError as error:
         raise CompileError(str(error)) from None
 
@@ -50,20 +52,25 @@ def packages() -> list[str]:
     ]
 
 
+def library_name(library: Path) -> str:
+    """The name that setuptools knows a library by, such as splashbench.render.kernel.librender_avx2."""
+    return ".".join([FOLDERS[library.parts[0]], *library.with_suffix("").parts[1:]])
+
+
 class BuildKernel(build_ext):
-    """A shared library for each variant of the kernel, loaded with ctypes: no module of Python, no name after one."""
+    """Shared libraries, loaded with ctypes: no modules of Python, and not named after one version of it."""
 
     def get_ext_filename(self, fullname: str) -> str:
-        return str(Path(*fullname.split("."))) + build_kernel.SYSTEMS[TARGET.system].suffix
+        return str(Path(*fullname.split("."))) + ".so"
 
     def build_extensions(self) -> None:
         folder = Path(self.get_finalized_command("build").build_base) / "kernel"
         try:
-            libraries = build_kernel.build(TARGET, compiler(), folder)
+            libraries = build_kernel.build(compiler(), folder)
         except KernelBuildError as error:
             raise CompileError(str(error)) from None
-        for extension, library in zip(self.extensions, libraries, strict=True):
-            build_kernel.place(library, Path(self.get_ext_fullpath(extension.name)))
+        for library, built in libraries.items():
+            build_kernel.place(built, Path(self.get_ext_fullpath(library_name(library))))
 
     def copy_extensions_to_source(self) -> None:
         build_py = self.get_finalized_command("build_py")
@@ -80,7 +87,7 @@ class PlatformWheel(bdist_wheel):
         if self.plat_name_supplied and self.plat_name:
             platform = self.plat_name.lower().replace("-", "_").replace(".", "_")
         else:
-            platform = build_kernel.wheel_platform(TARGET, compiler())
+            platform = compiler().wheel_platform
         return "py3", "none", platform
 
 
@@ -89,12 +96,13 @@ setup(
     package_dir={name: folder for folder, name in FOLDERS.items()},
     ext_modules=[
         Extension(
-            ".".join([*build_kernel.KERNEL.parts, f"libsplash_{variant.name}"]),
-            sources=[path.as_posix() for path in build_kernel.kernel_sources()],
-            depends=[path.as_posix() for path in build_kernel.kernel_headers()],
+            library_name(kernel.library(variant)),
+            sources=[path.as_posix() for path in kernel.sources()],
+            depends=[path.as_posix() for path in kernel.headers()],
             language="c++",
         )
-        for variant in TARGET.variants
+        for kernel in KERNELS
+        for variant in build_compilers.VARIANTS
     ],
     cmdclass={"build_ext": BuildKernel, "bdist_wheel": PlatformWheel},
 )

@@ -142,7 +142,7 @@ def main() -> int:
         "versions": {"gsplat": cuda.GSPLAT_VERSION, "torch": torch.__version__, "cuda": torch.version.cuda},
         "machine": hardware.describe(),
         "threads": thread_count(),
-        "kernel": native.variant(),
+        "kernel": native.KERNEL.variant,
         "repeats": options.repeats,
         "tests": run_tests(),
         "scenes": {

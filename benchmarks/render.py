@@ -49,7 +49,8 @@ import torch
 
 from splashbench.files import write_json
 from splashbench.harness import hardware
-from splashbench.render import cpu, freeze, native, rasterize, tile_modes, to_tiles
+from splashbench.native.threads import use_threads
+from splashbench.render import freeze, native, rasterize, tile_modes, to_tiles
 from splashbench.scene import Camera
 
 SCENES = {"iii": (5_000, 240, 160), "i": (20_000, 640, 416), "ii": (85_000, 1200, 1800)}
@@ -157,7 +158,7 @@ def our_pass(
     outer = outer or image_gradients(camera)
 
     def run() -> tuple[torch.Tensor, ...]:
-        with cpu.threads(threads):
+        with use_threads(threads):
             images = rasterize(*inputs, camera, background=BACKGROUND, backend="cpu", **options)
             return torch.autograd.grad(images, inputs, outer)
 
@@ -386,7 +387,7 @@ class Benchmark:
         return results | {
             "medians_ms": self.medians_ms,
             "machine": hardware.describe(),
-            "kernel": native.variant(),
+            "kernel": native.KERNEL.variant,
             "repeats": self.repeats,
             "missing": self.missing,
         }

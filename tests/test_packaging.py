@@ -113,6 +113,20 @@ def test_data_is_found_from_an_installed_wheel(wheel: Path, tmp_path: Path) -> N
     assert lines[1:] == ["20 real_scene.zip True", "True"]
 
 
+def test_compiled_kernels_are_loaded_from_an_installed_wheel(wheel: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+    code = (
+        "from splashbench.render.native import KERNEL as renderer;"
+        "from splashbench_methods.splashsplat.kernel.library import KERNEL as splashsplat;"
+        "[print(kernel.library._name, kernel.variant) for kernel in (renderer, splashsplat)]"
+    )
+    environment = {"PYTHONPATH": str(tmp_path), "SPLASHBENCH_SIMD": "baseline", "SPLASHBENCH_KERNEL": ""}
+    assert run_python(code, cwd=tmp_path, **environment).splitlines() == [
+        f"{tmp_path}/splashbench/render/kernel/librender_baseline.so baseline",
+        f"{tmp_path}/splashbench_methods/splashsplat/kernel/libsplashsplat_baseline.so baseline",
+    ]
+
+
 def run_python(code: str, cwd: Path, **environment: str) -> str:
     """Standard output of a fresh interpreter."""
     done = subprocess.run(

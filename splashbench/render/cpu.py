@@ -7,48 +7,31 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.parallel import thread_count
-from splashbench.render import arguments, counters, memory, native
+from splashbench.native import memory
+from splashbench.native.library import DONE, NOT_FINITE, OUT_OF_MEMORY, TOO_LARGE
+from splashbench.native.threads import kernel_threads
+from splashbench.render import arguments, counters
 from splashbench.render.arguments import Floats
 from splashbench.render.constants import TILE_HEIGHT, TILE_WIDTH
+from splashbench.render.native import KERNEL, CameraStruct, GaussiansStruct, GradientsStruct, OutputStruct
 from splashbench.render.tiles import SKIP, Modes, tile_grid
 from splashbench.scene.camera import Camera
-
-_threads: int | None = None
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Render on `count` threads within the body, for the whole process; else on splashbench.parallel.thread_count()."""
-    global _threads
-    before, _threads = _threads, count
-    try:
-        yield
-    finally:
-        _threads = before
-
-
-def kernel_threads() -> int:
-    """On how many threads the kernel works now."""
-    return min(_threads or thread_count(), native.MAX_THREADS)
 
 
 def _address(array: NDArray | None) -> int | None:
     return None if array is None else array.__array_interface__["data"][0]
 
 
-def _camera(camera: Camera) -> native.Camera:
+def _camera(camera: Camera) -> CameraStruct:
     K = camera.K
     matrix = (ctypes.c_double * 12)(*camera.w2c[:3].ravel().tolist())
-    return native.Camera(matrix, K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
+    return CameraStruct(matrix, K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
 
 
 class _Handle:
@@ -63,7 +46,7 @@ class _Handle:
     def __init__(self, *alive: Any) -> None:
         self.frame, self._alive = ctypes.c_void_p(), alive
         self.lock = threading.Lock()
-        self._release = native.library().splash_release  # at exit the module may be gone first
+        self._release = KERNEL.library.splash_release  # at exit the module may be gone first
 
     def __del__(self) -> None:
         if self._release is not None:
@@ -94,7 +77,7 @@ class Frozen:
     @property
     def bytes(self) -> int:
         """Memory that the kernel holds for it."""
-        return int(native.library().splash_frame_bytes(self.handle.frame))
+        return int(KERNEL.library.splash_frame_bytes(self.handle.frame))
 
 
 @dataclass
@@ -126,8 +109,8 @@ class Rendering:
                     raise ValueError(f"{name} is {list(grad.shape)}, not {list(image.shape)}")
             outer.append(grad)
         gradients = add_to or tuple(None if a is None else memory.empty(a.shape) for a in self.gaussians)
-        into = native.Gradients(int(add_to is not None), *map(_address, gradients))
-        backward = native.library().splash_backward
+        into = GradientsStruct(int(add_to is not None), *map(_address, gradients))
+        backward = KERNEL.library.splash_backward
         with self.handle.lock:
             status = backward(self.handle.frame, *map(_address, outer), kernel_threads(), ctypes.byref(into))
         _raise_for(status, self.gaussians)
@@ -136,26 +119,26 @@ class Rendering:
     def counts(self) -> dict[str, int]:
         """Gaussians drawn, (Gaussian, tile) pairs, and tiles that hold any."""
         counts = (ctypes.c_int64 * 3)()
-        native.library().splash_frame_counts(self.handle.frame, counts)
+        KERNEL.library.splash_frame_counts(self.handle.frame, counts)
         return dict(zip(("drawn", "pairs", "tiles"), counts))
 
 
 def _raise_for(status: int, gaussians: tuple[Floats, Floats, Floats, Floats | None]) -> None:
-    if status == native.DONE:
+    if status == DONE:
         return
-    if status == native.NOT_FINITE:
+    if status == NOT_FINITE:
         arguments.check_finite(*gaussians)
         raise ValueError("the Gaussians held values that are not finite, and were changed since")
-    if status == native.OUT_OF_MEMORY:
+    if status == OUT_OF_MEMORY:
         raise MemoryError("the renderer is out of memory: fewer Gaussians, smaller ones or smaller images need less")
-    if status == native.TOO_LARGE:
+    if status == TOO_LARGE:
         raise ValueError(f"means has {len(gaussians[0])} rows; the renderer takes fewer than 2^31")
     raise RuntimeError(f"the renderer's kernel answered {status}")
 
 
 def _gaussians(
     means: Any, factors: Any, opacities: Any, colors: Any
-) -> tuple[tuple[Floats, Floats, Floats, Floats | None], native.Gaussians]:
+) -> tuple[tuple[Floats, Floats, Floats, Floats | None], GaussiansStruct]:
     arrays = (
         arguments.floats(means, "means"),
         arguments.floats(factors, "factors"),
@@ -163,7 +146,7 @@ def _gaussians(
         None if colors is None else arguments.floats(colors, "colors"),
     )
     channels = arguments.check_shapes(*arrays)
-    return arrays, native.Gaussians(len(arrays[0]), channels, *map(_address, arrays))
+    return arrays, GaussiansStruct(len(arrays[0]), channels, *map(_address, arrays))
 
 
 def freeze(means: Any, factors: Any, opacities: Any, colors: Any, camera: Camera, *, depth: bool = False) -> Frozen:
@@ -178,9 +161,9 @@ def freeze(means: Any, factors: Any, opacities: Any, colors: Any, camera: Camera
     arrays, gaussians = _gaussians(means, factors, opacities, colors)
     # The arrays are kept beyond this call, so later changes by the caller must not reach them.
     arrays = tuple(None if a is None else a.copy() for a in arrays)  # type: ignore[assignment]
-    gaussians = native.Gaussians(len(arrays[0]), gaussians.channels, *map(_address, arrays))
+    gaussians = GaussiansStruct(len(arrays[0]), gaussians.channels, *map(_address, arrays))
     handle = _Handle(arrays)
-    status = native.library().splash_freeze(
+    status = KERNEL.library.splash_freeze(
         ctypes.byref(_camera(camera)), ctypes.byref(gaussians), int(depth), kernel_threads(), ctypes.byref(handle.frame)
     )
     _raise_for(status, arrays)
@@ -223,7 +206,7 @@ def forward(
         shape = (kept, TILE_HEIGHT, TILE_WIDTH)
         color_shape = (kept, channels, TILE_HEIGHT, TILE_WIDTH)
     color, opacity = memory.empty(color_shape), memory.empty(shape)
-    output = native.Output(
+    output = OutputStruct(
         int(depth),
         int(compact),
         int(behind is not None and behind.ndim == 3),
@@ -233,7 +216,7 @@ def forward(
         _address(opacity),
     )
     handle = _Handle(arrays, behind, frozen)
-    status = native.library().splash_forward(
+    status = KERNEL.library.splash_forward(
         ctypes.byref(_camera(camera)),
         ctypes.byref(gaussians),
         ctypes.byref(output),
@@ -242,5 +225,5 @@ def forward(
         ctypes.byref(handle.frame),
     )
     _raise_for(status, arrays)
-    counters.record(len(arrays[0]) + (0 if frozen is None else len(frozen)), f"cpu ({native.variant()})")
+    counters.record(len(arrays[0]) + (0 if frozen is None else len(frozen)), f"cpu ({KERNEL.variant})")
     return Rendering(color, opacity, handle, arrays)

@@ -11,7 +11,7 @@ import pytest
 from splashbench import parallel
 from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Run
-from splashbench.render import cpu
+from splashbench.native.threads import use_threads
 from splashbench.scene import Scene
 from splashbench_methods.controls.nothing import Nothing
 from splashbench_methods.scaffold_gs import Background, BackgroundSettings, ScaffoldGS, StaticScene, fit_background
@@ -60,7 +60,7 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
 ):
     def image(seed: int, threads: int) -> np.ndarray:
         monkeypatch.setattr(parallel, "thread_count", lambda: threads)
-        with cpu.threads(threads):
+        with use_threads(threads):
             return fit_background(balls.training(), settings, Run(seed=seed)).render(balls.cameras[balls.test[0]])
 
     first = image(3, 1)

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from splashbench.errors import SplashbenchError
+from splashbench.native.threads import use_threads
 from splashbench.render import COLOR, SKIP, counters, cpu, freeze, rasterize, rasterize_arrays
 from splashbench.scene.camera import Camera
 
@@ -241,7 +242,7 @@ def test_images_and_gradients_repeat_bit_for_bit_on_any_number_of_threads(camera
     first = everything(arrays, camera, channels)
     assert everything(arrays, camera, channels) == first
     for threads in (1, 2, 3, 7):
-        with cpu.threads(threads):
+        with use_threads(threads):
             assert everything(arrays, camera, channels) == first
 
 
@@ -269,7 +270,7 @@ def _render_in_child(arrays: list[np.ndarray], camera: Camera, queue: multiproce
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_process_renders(camera):
     arrays = scatter(20000)
-    with cpu.threads(3):
+    with use_threads(3):
         expected = everything(arrays, camera, 3)
         context = multiprocessing.get_context("fork")
         queue = context.Queue()

@@ -283,4 +283,4 @@ def test_memory_is_used_again_and_does_not_grow():
         step()
     gc.collect()
     assert process.memory_info().rss - before < 40e6
-    native.library().splash_trim()
+    native.KERNEL.library.splash_trim()

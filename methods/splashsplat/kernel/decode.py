@@ -21,7 +21,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from splashbench.render import cpu, memory, native
+from splashbench.native import memory
+from splashbench.native.library import DONE
+from splashbench.native.threads import kernel_threads
+
+from .library import KERNEL, CarriersStruct, ChildrenStruct, DecoderGradientsStruct, HeadsStruct
 
 MAX_CHILDREN = 64
 
@@ -158,7 +162,7 @@ class _Call:
         addresses = [_address(t) for t in self._alive]
         self.count, self.children = len(instant.phi), len(heads.opacity[1])
         self.cell_count = instant.cell_count if instant.cells is not None else 0
-        self.heads = native.Heads(
+        self.heads = HeadsStruct(
             features.shape[1],
             self.children,
             len(heads.hidden[1]),
@@ -170,7 +174,7 @@ class _Call:
             (ctypes.c_void_p * 10)(*addresses[8:]),
         )
         eye = (ctypes.c_float * 3)(*instant.eye.tolist())
-        self.carriers = native.Carriers(self.count, *addresses[:7], eye, addresses[7], self.cell_count)
+        self.carriers = CarriersStruct(self.count, *addresses[:7], eye, addresses[7], self.cell_count)
 
 
 class _Decode(torch.autograd.Function):
@@ -180,7 +184,7 @@ class _Decode(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, log_scales: Tensor, *rest: Any) -> tuple[Tensor | None, ...]:
         *weights, heads, instant, rows, wanted = rest
         call = _Call(heads, features, log_scales, tuple(weights), instant, rows)
-        n, k, library = call.count, call.children, native.library()
+        n, k, library = call.count, call.children, KERNEL.library
         children = [_empty(n, k, 3), _empty(n, k, 3, 3), _empty(n, k), _empty(n, k, 3), _empty(n, k, 3)]
         kept = _empty(library.splash_decode_kept(ctypes.byref(call.heads), n)) if wanted else None
         cell_colors = None if instant.cells is None else _empty(call.cell_count, 3)
@@ -188,13 +192,13 @@ class _Decode(torch.autograd.Function):
         status = library.splash_decode(
             ctypes.byref(call.heads),
             ctypes.byref(call.carriers),
-            ctypes.byref(native.Children(*map(_address, children))),
+            ctypes.byref(ChildrenStruct(*map(_address, children))),
             _address(kept),
             _address(cell_colors),
             penalties,
-            cpu.kernel_threads(),
+            kernel_threads(),
         )
-        if status != native.DONE:
+        if status != DONE:
             raise MemoryError("the decoder is out of memory: fewer carriers need less")
         if wanted:
             ctx.call, ctx.kept, ctx.cell_colors = call, kept, cell_colors
@@ -213,18 +217,18 @@ class _Decode(torch.autograd.Function):
         penalties = (ctypes.c_double * 3)(*([0.0] * 3 if outer[5] is None else outer[5].tolist()))
         by_rows = [_empty(call.count, features.shape[1]), _empty(call.count, 3)]
         by_weights = [torch.empty(w.shape) for w in weights]
-        gradients = native.DecoderGradients(*map(_address, by_rows), (ctypes.c_void_p * 10)(*map(_address, by_weights)))
-        status = native.library().splash_decode_backward(
+        gradients = DecoderGradientsStruct(*map(_address, by_rows), (ctypes.c_void_p * 10)(*map(_address, by_weights)))
+        status = KERNEL.library.splash_decode_backward(
             ctypes.byref(call.heads),
             ctypes.byref(call.carriers),
             _address(ctx.kept),
             _address(ctx.cell_colors),
-            ctypes.byref(native.Children(*map(_address, given))),
+            ctypes.byref(ChildrenStruct(*map(_address, given))),
             penalties,
-            cpu.kernel_threads(),
+            kernel_threads(),
             ctypes.byref(gradients),
         )
-        if status != native.DONE:
+        if status != DONE:
             raise MemoryError("the decoder is out of memory: fewer carriers need less")
         if rows is not None:
             shapes = (features.shape, log_scales.shape)

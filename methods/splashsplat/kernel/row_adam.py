@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splashbench.render import cpu, native
+from splashbench.native.threads import kernel_threads
+
+from .library import KERNEL, RowAdamStruct
 
 
 class RowMoments:
@@ -43,7 +45,7 @@ class RowMoments:
             with np.errstate(divide="ignore"):  # row 0 is never read
                 self._corrections = (1 / (1 - np.power(np.array(self._betas), taken))).astype(np.float32)
         rows, gradient = rows.contiguous(), gradient.detach().contiguous()
-        adam = native.RowAdam(
+        adam = RowAdamStruct(
             self._table.data_ptr(),
             self._first.data_ptr(),
             self._second.data_ptr(),
@@ -53,6 +55,6 @@ class RowMoments:
             *self._betas,
             self._epsilon,
         )
-        native.library().splash_adam_rows(
-            ctypes.byref(adam), len(rows), rows.data_ptr(), gradient.data_ptr(), rate, cpu.kernel_threads()
+        KERNEL.library.splash_adam_rows(
+            ctypes.byref(adam), len(rows), rows.data_ptr(), gradient.data_ptr(), rate, kernel_threads()
         )

@@ -18,7 +18,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splashbench.render import cpu, memory, native
+from splashbench.native import memory
+from splashbench.native.library import DONE
+from splashbench.native.threads import kernel_threads
+
+from .library import KERNEL, WindowStruct
 
 
 @dataclass(frozen=True)
@@ -65,9 +69,9 @@ def window_losses(image: Tensor, alpha: Tensor, photograph: Photograph) -> tuple
 def _run(function: Any, photograph: Photograph, image: Tensor, alpha: Tensor, *rest: Any) -> None:
     (rows, columns), (height, width) = photograph.mask.shape, alpha.shape
     truth, mask = photograph.image.data_ptr(), photograph.mask.data_ptr()
-    window = native.Window(width, height, photograph.left, photograph.top, columns, rows, truth, mask)
-    status = function(ctypes.byref(window), image.data_ptr(), alpha.data_ptr(), *rest, cpu.kernel_threads())
-    if status != native.DONE:
+    window = WindowStruct(width, height, photograph.left, photograph.top, columns, rows, truth, mask)
+    status = function(ctypes.byref(window), image.data_ptr(), alpha.data_ptr(), *rest, kernel_threads())
+    if status != DONE:
         raise MemoryError("the window's losses are out of memory")
 
 
@@ -76,7 +80,7 @@ class _WindowLosses(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, alpha: Tensor, photograph: Photograph) -> Tensor:
         image, alpha = image.contiguous(), alpha.contiguous()
         losses = (ctypes.c_double * 3)()
-        _run(native.library().splash_window_losses, photograph, image, alpha, losses)
+        _run(KERNEL.library.splash_window_losses, photograph, image, alpha, losses)
         ctx.photograph = photograph
         ctx.save_for_backward(image, alpha)
         return torch.tensor(list(losses), dtype=torch.float32)
@@ -87,6 +91,6 @@ class _WindowLosses(torch.autograd.Function):
         image, alpha = ctx.saved_tensors
         weights = (ctypes.c_double * 3)(*outer.tolist())
         by_image, by_alpha = (torch.from_numpy(memory.empty(tuple(t.shape))) for t in (image, alpha))
-        function = native.library().splash_window_gradients
+        function = KERNEL.library.splash_window_gradients
         _run(function, ctx.photograph, image, alpha, weights, by_image.data_ptr(), by_alpha.data_ptr())
         return by_image, by_alpha, None

@@ -2,19 +2,15 @@
 
 #include "api.h"
 
+#include <pthread.h>
+
 #include <algorithm>
 #include <mutex>
 #include <new>
 #include <vector>
-#ifndef _WIN32
-#include <pthread.h>
-#endif
 
-#include "adam.h"
-#include "decode.h"
 #include "frame.h"
-#include "threads.h"
-#include "window_loss.h"
+#include "native/threads.h"
 
 struct SplashFrame {
     splash::Frame frame;
@@ -38,12 +34,10 @@ std::vector<SplashFrame*>& kept() {
 
 // A child that was forked while another thread held the lock would wait for ever.
 void guard_forks() {
-#ifndef _WIN32
     static std::once_flag once;
     std::call_once(once, [] {
         pthread_atfork([] { kept_mutex.lock(); }, [] { kept_mutex.unlock(); }, [] { kept_mutex.unlock(); });
     });
-#endif
 }
 
 SplashFrame* take_frame() {
@@ -98,16 +92,6 @@ void set_modes(Frame& frame, const uint8_t* modes) {
         }
     }
 }
-
-// The first place in the caller's memory that vectors may start at.
-constexpr int64_t ALIGNMENT_FLOATS = 16;
-template <class T>
-T* aligned(T* at) {
-    const uintptr_t bytes = ALIGNMENT_FLOATS * sizeof(T);
-    return reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(at) + bytes - 1) / bytes * bytes);
-}
-
-int workers(int32_t threads) { return std::clamp<int32_t>(threads, 1, MAX_THREADS); }
 
 // Steps 1 to 3.
 int prepare(Frame& frame, const SplashCamera& camera, const SplashGaussians& gaussians, bool depth, const uint8_t* modes,
@@ -190,58 +174,6 @@ int splash_backward(SplashFrame* held, const float* grad_color, const float* gra
     }
 }
 
-int64_t splash_decode_kept(const SplashHeads* heads, int64_t carriers) {
-    return splash::blocks_of(carriers) * splash::Rows(*heads).total * splash::BLOCK + splash::ALIGNMENT_FLOATS;
-}
-
-int splash_decode(const SplashHeads* heads, const SplashCarriers* carriers, const SplashChildren* children, float* kept,
-                  float* cell_colors, double penalties[3], int32_t threads) {
-    try {
-        splash::decode(splash::Weights(*heads), *carriers, *children, kept == nullptr ? nullptr : splash::aligned(kept),
-                       cell_colors, penalties, splash::workers(threads));
-        return SPLASH_DONE;
-    } catch (...) {  // nothing but std::bad_alloc is thrown
-        return SPLASH_OUT_OF_MEMORY;
-    }
-}
-
-int splash_decode_backward(const SplashHeads* heads, const SplashCarriers* carriers, const float* kept,
-                           const float* cell_colors, const SplashChildren* grad_children, const double grad_penalties[3],
-                           int32_t threads, const SplashDecoderGradients* gradients) {
-    try {
-        splash::decode_backward(splash::Weights(*heads), *carriers, splash::aligned(kept), cell_colors, *grad_children,
-                                grad_penalties, splash::workers(threads), *gradients);
-        return SPLASH_DONE;
-    } catch (...) {  // nothing but std::bad_alloc is thrown
-        return SPLASH_OUT_OF_MEMORY;
-    }
-}
-
-void splash_adam_rows(const SplashRowAdam* adam, int64_t count, const int64_t* rows, const float* gradient, float rate,
-                      int32_t threads) {
-    splash::adam_rows(*adam, count, rows, gradient, rate, splash::workers(threads));
-}
-
-int splash_window_losses(const SplashWindow* window, const float* image, const float* opacity, double losses[3],
-                         int32_t threads) {
-    try {
-        splash::window_losses(*window, image, opacity, losses, splash::workers(threads));
-        return SPLASH_DONE;
-    } catch (...) {  // nothing but std::bad_alloc is thrown
-        return SPLASH_OUT_OF_MEMORY;
-    }
-}
-
-int splash_window_gradients(const SplashWindow* window, const float* image, const float* opacity, const double weights[3],
-                            float* grad_image, float* grad_opacity, int32_t threads) {
-    try {
-        splash::window_gradients(*window, image, opacity, weights, grad_image, grad_opacity, splash::workers(threads));
-        return SPLASH_DONE;
-    } catch (...) {  // nothing but std::bad_alloc is thrown
-        return SPLASH_OUT_OF_MEMORY;
-    }
-}
-
 void splash_release(SplashFrame* held) {
     if (held == nullptr) return;
     if (!held->frame.frozen_itself && splash_frame_bytes(held) <= splash::KEPT_BYTES) {
@@ -277,7 +209,7 @@ void splash_frame_counts(const SplashFrame* held, int64_t counts[3]) {
 
 int splash_abi_version(void) { return SPLASH_ABI_VERSION; }
 
-const char* splash_variant(void) { return SPLASH_VARIANT; }
+const char* splash_kernel(void) { return "render"; }
 
 int splash_tile_width(void) { return splash::TILE_WIDTH; }
 

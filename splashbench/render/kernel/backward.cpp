@@ -11,9 +11,11 @@
 
 #include "footprint.h"
 #include "frame.h"
+#include "native/elementary.h"
+#include "native/simd.h"
+#include "native/threads.h"
 #include "projection.h"
-#include "simd.h"
-#include "threads.h"
+#include "thresholds.h"
 
 namespace splash {
 namespace {
@@ -95,10 +97,10 @@ inline void take_back(const Layer& layer, int index, const TileFrame& tile, cons
             const Floats u = root * load(columns + static_cast<uint32_t>(vector) % VECTORS * LANES) - shift;
             const Floats square = u * u;
             const Floats exponent = peak - square;
-            const Ints drawn = (exponent >= CONSTANTS.log2_min_alpha) & (load(stops + vector * LANES) > index);
+            const Ints drawn = (exponent >= THRESHOLDS.log2_min_alpha) & (load(stops + vector * LANES) > index);
             const Floats raw = exp2(exponent);
-            const Floats alpha = where(drawn, CLAMPED ? min(raw, CONSTANTS.max_alpha) : raw);
-            const Floats per_kept = CONSTANTS.one / (CONSTANTS.one - alpha);
+            const Floats alpha = where(drawn, CLAMPED ? min(raw, THRESHOLDS.max_alpha) : raw);
+            const Floats per_kept = THRESHOLDS.one / (THRESHOLDS.one - alpha);
             const Floats rest = load(cell + LANES);
             Floats by_alpha = -per_kept * rest;
             if (channels > 0) {
@@ -116,7 +118,7 @@ inline void take_back(const Layer& layer, int index, const TileFrame& tile, cons
             }
             if (FROZEN) continue;
             Floats v = alpha * by_alpha;
-            if (CLAMPED) v = where(raw <= CONSTANTS.max_alpha, v);
+            if (CLAMPED) v = where(raw <= THRESHOLDS.max_alpha, v);
             row_m += v;
             row_mu += v * u;
             row_muu += v * square;

@@ -6,7 +6,7 @@
 #include <algorithm>
 
 #include "frame.h"
-#include "threads.h"
+#include "native/threads.h"
 #include "tiles.h"
 
 namespace splash {

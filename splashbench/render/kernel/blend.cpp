@@ -12,8 +12,9 @@
 
 #include "footprint.h"
 #include "frame.h"
-#include "simd.h"
-#include "threads.h"
+#include "native/simd.h"
+#include "native/threads.h"
+#include "thresholds.h"
 
 namespace splash {
 
@@ -101,12 +102,12 @@ inline void add_layer(const Layer& layer, int index, const Footprint& f, const f
             const Floats u = root * load(columns + static_cast<uint32_t>(vector) % VECTORS * LANES) - shift;
             const Floats exponent = peak - u * u;
             const Floats t = load(cell);
-            const Ints drawn = (exponent >= CONSTANTS.log2_min_alpha) & (t > 0.0f);
+            const Ints drawn = (exponent >= THRESHOLDS.log2_min_alpha) & (t > 0.0f);
             Floats alpha = exp2(exponent);
-            if (CLAMPED) alpha = min(alpha, CONSTANTS.max_alpha);
+            if (CLAMPED) alpha = min(alpha, THRESHOLDS.max_alpha);
             Floats weight = where(drawn, alpha * t);
             const Floats behind = t - weight;
-            const Ints exhausted = drawn & (behind <= CONSTANTS.min_transmittance);
+            const Ints exhausted = drawn & (behind <= THRESHOLDS.min_transmittance);
             if (__builtin_expect(any(exhausted), 0)) {
                 weight = where(~exhausted, weight);
                 store(cell, t - weight);

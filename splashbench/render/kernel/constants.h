@@ -11,8 +11,6 @@ constexpr float MAX_ALPHA = 0.999f;
 constexpr float MIN_TRANSMITTANCE = 1e-4f;
 constexpr float JACOBIAN_MARGIN = 0.15f;
 
-constexpr float LOG2_E = 1.4426950408889634f;
-constexpr float LN_2 = 0.6931471805599453f;
 constexpr float LOG2_MIN_ALPHA = -7.994353436858858f;
 
 // Large tiles keep the lists short; the spans of footprint.h keep the pixels outside an ellipse cheap.

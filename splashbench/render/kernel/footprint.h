@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "frame.h"
-#include "simd.h"
+#include "native/simd.h"
 #include "tiles.h"
 
 namespace splash {

@@ -4,8 +4,8 @@
 #include <cstdint>
 
 #include "api.h"
-#include "buffer.h"
 #include "constants.h"
+#include "native/buffer.h"
 
 namespace splash {
 

@@ -9,9 +9,10 @@
 #include <cmath>
 #include <cstring>
 
+#include "native/elementary.h"
+#include "native/threads.h"
 #include "projection.h"
 #include "tiles.h"
-#include "threads.h"
 
 namespace splash {
 namespace {

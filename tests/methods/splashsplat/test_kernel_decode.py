@@ -13,7 +13,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from splashbench.render import cpu
+from splashbench.native.threads import use_threads
 from splashbench_methods.splashsplat.appearance.decoder import (
     CarrierState,
     ColourCells,
@@ -118,7 +118,7 @@ def test_children_and_gradients_are_those_of_the_definition(n, seed, hidden_from
 def test_the_number_of_threads_does_not_matter():
     results = []
     for threads in (1, 2, 5):
-        with cpu.threads(threads):
+        with use_threads(threads):
             results.append(outcome(case(3000), torch.float32))
     for other in results[1:]:
         assert all(torch.equal(value, other[name]) for name, value in results[0].items())

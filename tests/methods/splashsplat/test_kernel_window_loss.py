@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splashbench.render import cpu
+from splashbench.native.threads import use_threads
 from splashbench_methods.splashsplat.appearance import losses
 from splashbench_methods.splashsplat.kernel.window_loss import Photograph, window_losses
 
@@ -67,7 +67,7 @@ def test_losses_and_gradients_are_those_of_the_definition(rows, columns, around,
 def test_the_number_of_threads_does_not_matter():
     results = []
     for threads in (1, 2, 5):
-        with cpu.threads(threads):
+        with use_threads(threads):
             results.append(outcome(case(100, 90, (3, 4, 5, 6)), True))
     for other in results[1:]:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other))

@@ -3,8 +3,8 @@
 #include <cmath>
 
 #include "adam.h"
-#include "simd.h"
-#include "threads.h"
+#include "native/simd.h"
+#include "native/threads.h"
 
 namespace splash {
 

@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "simd.h"
+#include "native/simd.h"
 
 namespace splash {
 

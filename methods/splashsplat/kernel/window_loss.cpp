@@ -8,9 +8,9 @@
 #include <algorithm>
 #include <cmath>
 
-#include "buffer.h"
-#include "elementary.h"
-#include "threads.h"
+#include "native/buffer.h"
+#include "native/elementary.h"
+#include "native/threads.h"
 
 namespace splash {
 namespace {

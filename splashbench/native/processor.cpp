@@ -1,12 +1,11 @@
-// Which variant of the kernel this processor runs. Asked by hand, because the compilers' own question needs a run-time
-// library that not all of them bring.
+// Which variant this library is, and which one this processor runs. The processor is asked by hand, because the compilers'
+// own question needs a run-time library that not all of them bring.
+
+#include <cpuid.h>
 
 #include <cstring>
 
-#include "api.h"
-
-#if defined(__x86_64__) || defined(_M_X64)
-#include <cpuid.h>
+#include "abi.h"
 
 namespace {
 
@@ -31,8 +30,8 @@ bool runs_x86_64_v4() {
     __asm__("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
     const unsigned all_registers = 0xe6;
     if ((saved & all_registers) != all_registers || !__get_cpuid_count(7, 0, &a, &b, &c, &d)) return false;
-    const unsigned wanted = bit_AVX512F | bit_AVX512DQ | bit_AVX512CD | bit_AVX512BW | bit_AVX512VL;
-    return (b & wanted) == wanted;
+    const unsigned common = bit_AVX512F | bit_AVX512DQ | bit_AVX512CD | bit_AVX512BW | bit_AVX512VL;
+    return (b & common) == common;
 }
 
 }  // namespace
@@ -45,7 +44,5 @@ extern "C" int splash_runs(const char* variant) {
 
 // The avx512 variant is there for those who ask for it: its gain has not been measured.
 extern "C" const char* splash_best_variant(void) { return runs_x86_64_v3() ? "avx2" : "baseline"; }
-#else
-extern "C" int splash_runs(const char* variant) { return std::strcmp(variant, "neon") == 0; }
-extern "C" const char* splash_best_variant(void) { return "neon"; }
-#endif
+
+extern "C" const char* splash_variant(void) { return SPLASH_VARIANT; }

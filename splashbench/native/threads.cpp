@@ -3,25 +3,18 @@
 
 #include "threads.h"
 
+#include <pthread.h>
+
 #include <condition_variable>
 #include <mutex>
 #include <new>
 #include <system_error>
 #include <thread>
-#ifndef _WIN32
-#include <pthread.h>
-#endif
 
 namespace splash {
 namespace {
 
-inline void pause() {
-#if defined(__x86_64__) || defined(_M_X64)
-    __builtin_ia32_pause();
-#elif defined(__aarch64__)
-    __asm__ __volatile__("yield");
-#endif
-}
+inline void pause() { __builtin_ia32_pause(); }
 
 constexpr int SPINS = 2000;
 
@@ -121,10 +114,8 @@ Pool* current_pool() {
     if (found != nullptr) return found;
     Pool* const made = new Pool;
     if (pool.compare_exchange_strong(found, made)) {
-#ifndef _WIN32
         static std::once_flag once;
         std::call_once(once, [] { pthread_atfork(nullptr, nullptr, [] { pool.store(nullptr); }); });
-#endif
         return made;
     }
     delete made;

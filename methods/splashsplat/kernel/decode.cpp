@@ -5,9 +5,9 @@
 #include <algorithm>
 #include <cmath>
 
-#include "elementary.h"
 #include "multiply.h"
-#include "threads.h"
+#include "native/elementary.h"
+#include "native/threads.h"
 
 namespace splash {
 namespace {

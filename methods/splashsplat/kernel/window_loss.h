@@ -1,4 +1,4 @@
-// Losses of a rendered window against a photograph and its mask; ../window_loss.py has the equations.
+// Losses of a rendered window against a photograph and its mask; window_loss.py has the equations.
 #pragma once
 
 #include "api.h"

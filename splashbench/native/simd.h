@@ -4,11 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#if defined(__SSE2__)
 #include <immintrin.h>
-#elif defined(__ARM_NEON)
-#include <arm_neon.h>
-#endif
 
 #ifndef SPLASH_LANES
 #error "SPLASH_LANES (4, 8 or 16 floats per vector) comes from the build file"
@@ -36,26 +32,22 @@ inline void store_anywhere(float* at, Floats value) { *reinterpret_cast<Unaligne
 // GCC makes two instructions of the comparison and the choice where the processor has one. (With a mask of all lanes, which
 // it drops again, because it says of the header's plain form that it reads what was never set.)
 inline Floats min(Floats a, Floats b) {
-#if defined(__AVX512F__) && SPLASH_LANES == 16
+#if SPLASH_LANES == 16
     return (Floats)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b);
-#elif defined(__AVX__) && SPLASH_LANES == 8
+#elif SPLASH_LANES == 8
     return (Floats)_mm256_min_ps((__m256)a, (__m256)b);
-#elif defined(__SSE2__) && SPLASH_LANES == 4
-    return (Floats)_mm_min_ps((__m128)a, (__m128)b);
 #else
-    return a < b ? a : b;
+    return (Floats)_mm_min_ps((__m128)a, (__m128)b);
 #endif
 }
 
 inline Floats max(Floats a, Floats b) {
-#if defined(__AVX512F__) && SPLASH_LANES == 16
+#if SPLASH_LANES == 16
     return (Floats)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b);
-#elif defined(__AVX__) && SPLASH_LANES == 8
+#elif SPLASH_LANES == 8
     return (Floats)_mm256_max_ps((__m256)a, (__m256)b);
-#elif defined(__SSE2__) && SPLASH_LANES == 4
-    return (Floats)_mm_max_ps((__m128)a, (__m128)b);
 #else
-    return a > b ? a : b;
+    return (Floats)_mm_max_ps((__m128)a, (__m128)b);
 #endif
 }
 
@@ -77,18 +69,12 @@ inline Floats ramp() {
 
 // Whether any lane of the mask (all bits or none) is set.
 inline bool any(Ints mask) {
-#if defined(__AVX512DQ__) && SPLASH_LANES == 16
+#if SPLASH_LANES == 16
     return _mm512_movepi32_mask((__m512i)mask) != 0;
-#elif defined(__AVX__) && SPLASH_LANES == 8
+#elif SPLASH_LANES == 8
     return _mm256_movemask_ps((__m256)mask) != 0;
-#elif defined(__SSE2__) && SPLASH_LANES == 4
-    return _mm_movemask_ps((__m128)mask) != 0;
-#elif defined(__aarch64__) && SPLASH_LANES == 4
-    return vmaxvq_u32((uint32x4_t)mask) != 0;
 #else
-    int32_t set = 0;
-    for (int lane = 0; lane < LANES; ++lane) set |= mask[lane];
-    return set != 0;
+    return _mm_movemask_ps((__m128)mask) != 0;
 #endif
 }
 
@@ -108,24 +94,23 @@ inline int32_t largest(Ints value) {
     return result;
 }
 
-// Constants of the inner loops. They stand in memory, out of the compiler's sight (simd.cpp): it would rather spread each
-// from one float anew in every turn than read the vector as an operand.
-struct Constants {
+// Constants of exp2. They stand in memory, out of the compiler's sight (simd.cpp): it would rather spread each from one
+// float anew in every turn of a loop than read the vector as an operand.
+struct Exp2Constants {
     Floats rounding;
-    Floats power[6];
-    Floats log2_min_alpha, max_alpha, min_transmittance, one;
+    Floats polynomial[6];
 };
-extern const Constants CONSTANTS;
+extern const Exp2Constants EXP2;
 
 // 2^x for x in [-30, 1], relative error below 3e-7: the integer part goes into the exponent, a polynomial takes the rest
 // (in [-1/2, 1/2]). Adding 1.5 * 2^23 rounds to an integer that stands in the low bits of the sum.
 inline Floats exp2(Floats x) {
-    const Floats rounding = CONSTANTS.rounding;
+    const Floats rounding = EXP2.rounding;
     const Floats shifted = x + rounding;
     const Ints exponent = (Ints)shifted << 23;
     const Floats f = x - (shifted - rounding);
-    Floats p = CONSTANTS.power[5];
-    for (int i = 4; i >= 0; --i) p = p * f + CONSTANTS.power[i];
+    Floats p = EXP2.polynomial[5];
+    for (int i = 4; i >= 0; --i) p = p * f + EXP2.polynomial[i];
     return (Floats)((Ints)p + exponent);
 }
 

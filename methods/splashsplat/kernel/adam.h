@@ -1,4 +1,4 @@
-// Adam for some rows of a table; ../rows.py has the equations.
+// Adam for some rows of a table; row_adam.py has the equations.
 #pragma once
 
 #include <cstdint>

@@ -4,9 +4,9 @@
 #include <cmath>
 
 #include "decode.h"
-#include "elementary.h"
 #include "multiply.h"
-#include "threads.h"
+#include "native/elementary.h"
+#include "native/threads.h"
 
 namespace splash {
 namespace {

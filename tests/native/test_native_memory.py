@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.render import memory
+from splashbench.native import memory
 
 SHAPE = (600, 500, 3)
 

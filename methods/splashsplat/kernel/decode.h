@@ -1,4 +1,4 @@
-// Carriers to Gaussians (paper, "Decoding Carriers into Gaussians"; ../decode.py has the equations).
+// Carriers to Gaussians (paper, "Decoding Carriers into Gaussians"; decode.py has the equations).
 //
 // Carriers are worked on in blocks of BLOCK, one carrier a lane, each quantity a row of BLOCK floats. The heads' weights
 // are packed into two matrices, so that a block passes through all heads by two products:
@@ -10,8 +10,8 @@
 #include <cstdint>
 
 #include "api.h"
-#include "buffer.h"
-#include "simd.h"
+#include "native/buffer.h"
+#include "native/simd.h"
 
 namespace splash {
 

@@ -9,6 +9,9 @@ namespace splash {
 
 constexpr int MAX_THREADS = 64;
 
+// How many workers a caller that asks for so many threads gets.
+inline int workers(int threads) { return std::clamp(threads, 1, MAX_THREADS); }
+
 // Calls work(argument, worker) for every worker in [0, workers), on this thread and on others that are kept between calls,
 // and waits. One thread may do the work of several workers, one after another, and does while somebody else uses the
 // threads: work must not wait for other workers. Rethrows std::bad_alloc.

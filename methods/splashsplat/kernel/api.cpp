@@ -1,0 +1,84 @@
+// The C interface: checks nothing (the Python files beside it do), and turns exceptions into a status.
+
+#include "api.h"
+
+#include <cstdint>
+
+#include "adam.h"
+#include "decode.h"
+#include "native/threads.h"
+#include "window_loss.h"
+
+namespace splash {
+namespace {
+
+// The first place in the caller's memory that vectors may start at.
+constexpr int64_t ALIGNMENT_FLOATS = 16;
+template <class T>
+T* aligned(T* at) {
+    const uintptr_t bytes = ALIGNMENT_FLOATS * sizeof(T);
+    return reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(at) + bytes - 1) / bytes * bytes);
+}
+
+}  // namespace
+}  // namespace splash
+
+extern "C" {
+
+int64_t splash_decode_kept(const SplashHeads* heads, int64_t carriers) {
+    return splash::blocks_of(carriers) * splash::Rows(*heads).total * splash::BLOCK + splash::ALIGNMENT_FLOATS;
+}
+
+int splash_decode(const SplashHeads* heads, const SplashCarriers* carriers, const SplashChildren* children, float* kept,
+                  float* cell_colors, double penalties[3], int32_t threads) {
+    try {
+        splash::decode(splash::Weights(*heads), *carriers, *children, kept == nullptr ? nullptr : splash::aligned(kept),
+                       cell_colors, penalties, splash::workers(threads));
+        return SPLASH_DONE;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+int splash_decode_backward(const SplashHeads* heads, const SplashCarriers* carriers, const float* kept,
+                           const float* cell_colors, const SplashChildren* grad_children, const double grad_penalties[3],
+                           int32_t threads, const SplashDecoderGradients* gradients) {
+    try {
+        splash::decode_backward(splash::Weights(*heads), *carriers, splash::aligned(kept), cell_colors, *grad_children,
+                                grad_penalties, splash::workers(threads), *gradients);
+        return SPLASH_DONE;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+void splash_adam_rows(const SplashRowAdam* adam, int64_t count, const int64_t* rows, const float* gradient, float rate,
+                      int32_t threads) {
+    splash::adam_rows(*adam, count, rows, gradient, rate, splash::workers(threads));
+}
+
+int splash_window_losses(const SplashWindow* window, const float* image, const float* opacity, double losses[3],
+                         int32_t threads) {
+    try {
+        splash::window_losses(*window, image, opacity, losses, splash::workers(threads));
+        return SPLASH_DONE;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+int splash_window_gradients(const SplashWindow* window, const float* image, const float* opacity, const double weights[3],
+                            float* grad_image, float* grad_opacity, int32_t threads) {
+    try {
+        splash::window_gradients(*window, image, opacity, weights, grad_image, grad_opacity, splash::workers(threads));
+        return SPLASH_DONE;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+const char* splash_kernel(void) { return "splashsplat"; }
+
+int splash_abi_version(void) { return SPLASH_ABI_VERSION; }
+
+}  // extern "C"

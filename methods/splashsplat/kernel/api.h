@@ -1,0 +1,102 @@
+// The C interface of SplashSplat's kernel, which library.py states to Python. Arrays are C-contiguous float32 unless said
+// otherwise.
+#pragma once
+
+#include <stdint.h>
+
+#include "native/abi.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+// Raised with every change to what follows; the loader refuses another version.
+#define SPLASH_ABI_VERSION 1
+
+// Heads that turn n carriers' features into K children each (decode.py): weights [outputs, inputs], biases [outputs].
+typedef struct SplashHeads {
+    int32_t features, children, hidden;  // F; K; H, the width of the colour head's hidden layer
+    float offset_bound, scale_range, opacity_slope, opacity_band, separation_margin;
+    const float *offset_weight, *offset_bias;    // [3K, F], [3K]
+    const float *scale_weight, *scale_bias;      // [3K, F], [3K]
+    const float *opacity_weight, *opacity_bias;  // [K, F], [K]
+    const float *hidden_weight, *hidden_bias;    // [H, F + 3], [H]
+    const float *color_weight, *color_bias;      // [3K, H], [3K]
+} SplashHeads;
+
+typedef struct SplashCarriers {
+    int64_t count;             // n
+    const int64_t* rows;       // [n] of the two tables; null: 0 to n - 1
+    const float* features;     // table [., F]
+    const float* log_scales;   // table [., 3]
+    const float* positions;    // [n, 3]
+    const float* deformation;  // [n, 3, 3]
+    const float* phi;          // [n]
+    const float* visibility;   // [n]; null: 1
+    float eye[3];
+    const int64_t* cells;      // [n], from 0 to cell_count - 1; null: no penalties
+    int64_t cell_count;
+} SplashCarriers;
+
+// What a carrier's children are, or gradients by it; of gradients null is zero.
+typedef struct SplashChildren {
+    float* means;      // [n, K, 3]
+    float* factors;    // [n, K, 3, 3]
+    float* opacities;  // [n, K]
+    float* colors;     // [n, K, 3]
+    float* offsets;    // [n, K, 3]
+} SplashChildren;
+
+// Gradients by what is learned, overwritten.
+typedef struct SplashDecoderGradients {
+    float *features, *log_scales;  // [n, F], [n, 3]: of the rows used
+    float *offset_weight, *offset_bias, *scale_weight, *scale_bias, *opacity_weight, *opacity_bias;
+    float *hidden_weight, *hidden_bias, *color_weight, *color_bias;
+} SplashDecoderGradients;
+
+// Floats that splash_decode keeps for splash_decode_backward.
+SPLASH_API int64_t splash_decode_kept(const SplashHeads*, int64_t carriers);
+
+// Decodes. kept: for the backward pass, of splash_decode_kept floats; null: there will be none.
+// Where there are cells, also cell_colors [cell_count, 3], the mean colour in each cell, and the penalties: mean trace of
+// the covariances, mean squared hinge of the children's distances, mean squared distance of the colours from their cell's.
+SPLASH_API int splash_decode(const SplashHeads*, const SplashCarriers*, const SplashChildren*, float* kept,
+                             float* cell_colors, double penalties[3], int32_t threads);
+
+// Gradients of a loss, given those by the children and by the penalties.
+SPLASH_API int splash_decode_backward(const SplashHeads*, const SplashCarriers*, const float* kept, const float* cell_colors,
+                                      const SplashChildren* grad_children, const double grad_penalties[3], int32_t threads,
+                                      const SplashDecoderGradients*);
+
+// A step of Adam for some rows of a table [., width]. corrections: [., 2], what the first and the second moment are
+// multiplied by after so many steps. rows: each at most once.
+typedef struct SplashRowAdam {
+    float *table, *first, *second;  // [., width]
+    int32_t* steps;                 // [.] taken so far
+    int64_t width;
+    const float* corrections;
+    double beta1, beta2, epsilon;
+} SplashRowAdam;
+SPLASH_API void splash_adam_rows(const SplashRowAdam*, int64_t count, const int64_t* rows, const float* gradient, float rate,
+                                 int32_t threads);
+
+// A rendered window and what is known of it: photograph and mask of a box within; outside, the mask is empty.
+typedef struct SplashWindow {
+    int32_t width, height;               // of the window
+    int32_t left, top, columns, rows;    // the box
+    const uint8_t* truth;                // [rows, columns, 3]
+    const uint8_t* mask;                 // [rows, columns], 0 or not
+} SplashWindow;
+
+// Losses of an image [height, width, 3] and its opacity [height, width]: mean |error| in the mask, mean |step of the error|
+// over pairs of neighbours that meet the mask, both within the box; sum of |opacity - mask| over the window.
+SPLASH_API int splash_window_losses(const SplashWindow*, const float* image, const float* opacity, double losses[3],
+                                    int32_t threads);
+
+// Gradients of the losses' weighted sum.
+SPLASH_API int splash_window_gradients(const SplashWindow*, const float* image, const float* opacity, const double weights[3],
+                                       float* grad_image, float* grad_opacity, int32_t threads);
+
+#ifdef __cplusplus
+}
+#endif
