@@ -37,25 +37,26 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench leaderboard`."""
     from splashbench.files import files_together
     from splashbench.report.charts import speed_accuracy_chart
-    from splashbench.report.leaderboard import leaderboard_rows, write_leaderboard
+    from splashbench.report.leaderboard import write_leaderboard
     from splashbench.report.results import load_results
+    from splashbench.report.table import leaderboard_table
 
     sources = load_results(arguments.results)
+    table = leaderboard_table(sources)
     # All four or none: a table without its chart would be taken for whole.
     with files_together(arguments.out) as staging:
-        made = write_leaderboard(sources, staging, with_paper=arguments.with_paper)
+        made = write_leaderboard(table, sources, staging, with_paper=arguments.with_paper)
         made += speed_accuracy_chart(sources, staging, with_paper=arguments.with_paper)
     files = [arguments.out / path.name for path in made]
-    rows = leaderboard_rows(sources)
-    failed = sum(not row.ok for row in rows)
-    say(f"{len(sources)} results, {len(rows)} rows{f', {failed} of them failed runs' if failed else ''}")
+    failed = int(table["failed"].sum())
+    say(f"{len(sources)} results, {len(table)} rows{f', {failed} of them failed runs' if failed else ''}")
     for file in files:
         say(f"wrote {file}")
     if arguments.json:
         emit(
             {
                 "results": len(sources),
-                "rows": len(rows),
+                "rows": len(table),
                 "failed_runs": failed,
                 "files": [str(file) for file in files],
                 "sources": [source.path for source in sources],

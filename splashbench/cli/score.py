@@ -124,7 +124,8 @@ def _protocol(changes: list[str]) -> Protocol:
 def _summary(results: list[Result]) -> str:
     from splashbench.errors import one_line
     from splashbench.score import METRICS
-    from splashbench.score.metrics import FILTER_NOTE, TRUTH_METRICS
+    from splashbench.score.metrics import TRUTH_METRICS
+    from splashbench.score.notation import FILTER_NOTE
 
     lines = [_figures(results, _SHOWN)]
     with_truth = [result for result in results if result.digests.truth is not None]
@@ -152,14 +153,14 @@ def _summary(results: list[Result]) -> str:
 def _figures(results: list[Result], names: Sequence[str]) -> str:
     """A table with a row per result and a column per metric of `names`."""
     from splashbench.score import METRICS
-    from splashbench.score.metrics import filter_mark, format_value
+    from splashbench.score.notation import filter_mark, label, stored
 
     rows = []
     for result in results:
         figures = {name: result.value(name) for name in names}
         cells = [
-            format_value(name, value, "-") + filter_mark(METRICS[name], result.mixed, value)
+            stored(name, value, "-") + filter_mark(METRICS[name], result.mixed, value)
             for name, value in figures.items()
         ]
         rows.append([result.method, str(result.seed), result.status, *cells])
-    return table(["method", "seed", "status", *(METRICS[name].label for name in names)], rows)
+    return table(["method", "seed", "status", *(label(METRICS[name]) for name in names)], rows)

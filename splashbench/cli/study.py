@@ -78,7 +78,7 @@ def _positive(text: str) -> int:
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench study ablate`."""
     from splashbench.harness.runner import parse_overrides
-    from splashbench.study.execution import Options, carry_out_plan
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan
     from splashbench.study.job import Store
     from splashbench.study.plan import make_plan
     from splashbench.study.report import as_json, write_report
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in arguments.only or []:
         spec.variant(name)
     plan = make_plan(spec)
-    options = Options(
+    options = ExecutionOptions(
         only=tuple(arguments.only) if arguments.only else None,
         jobs=arguments.jobs,
         keep=arguments.keep,

@@ -11,9 +11,10 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from splashbench.files import atomic_path
-from splashbench.report.results import Source
-from splashbench.report.speed_accuracy import Entry, Machine, Summary, machines, pareto_front, reported_machine
-from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE, METRICS
+from splashbench.report.results import ResultFile
+from splashbench.report.speed_accuracy import ChartedMethod, Machine, Summary, machines, pareto_front, reported_machine
+from splashbench.score.metrics import METRICS
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +40,7 @@ _STYLE: dict[str, Any] = {
 }
 
 
-def speed_accuracy_chart(sources: Sequence[Source], out: Path, with_paper: bool = False) -> list[Path]:
+def speed_accuracy_chart(sources: Sequence[ResultFile], out: Path, with_paper: bool = False) -> list[Path]:
     """Draw speed_accuracy.png and .svg into the folder `out`; returns their paths.
 
     Faint dots are runs, full marks the inter-quartile mean of a method with 95% bootstrap bars, the staircase the
@@ -94,14 +95,13 @@ def _panel(axes: Axes, row: Machine, name: str, looks: dict[str, tuple[str, str]
             0.5, 0.5, f"no run has {metric.title} and a fit time", transform=axes.transAxes, ha="center", color=_GREY
         )
     axes.set_xlabel("fit time, log scale (← faster)")
-    unit = f" ({metric.unit})" if metric.unit else ""
-    axes.set_ylabel(f"{metric.title}{unit}, {'higher is better →' if higher else '← lower is better'}")
+    axes.set_ylabel(f"{label(metric, arrow=False)}, {'higher is better →' if higher else '← lower is better'}")
     axes.grid(True, which="major", color="#E6E6E6", linewidth=0.7)
     axes.set_axisbelow(True)
 
 
 def _draw_entry(
-    axes: Axes, entry: Entry, mean: Summary, name: str, look: tuple[str, str], largest: float, reported: bool
+    axes: Axes, entry: ChartedMethod, mean: Summary, name: str, look: tuple[str, str], largest: float, reported: bool
 ) -> None:
     colour, shape = look
     if len(entry.dots) > 1:

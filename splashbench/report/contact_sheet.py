@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splashbench.files import atomic_path
 from splashbench.scene import Scene
-from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

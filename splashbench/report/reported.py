@@ -5,13 +5,15 @@ Only NeuroFluid's scenes have figures of their own there (Tables 3 and S4); of r
 
 from __future__ import annotations
 
-from splashbench.score.metrics import METRICS, format_value
+from splashbench.markdown import table
+from splashbench.score.metrics import METRICS
+from splashbench.score.notation import label, shown
 
-_FIGURES = ("psnr", "ssim", "lpips", "jitter_error")
+_FIGURES = [METRICS[name] for name in ("psnr", "ssim", "lpips", "jitter_error")]
 
 
-def reported_table(scene: str) -> tuple[str, list[list[str]]] | None:
-    """What to say above the table, and its lines with their head; None for a scene of which the paper prints nothing.
+def reported_table(scene: str) -> list[str]:
+    """A line of introduction and the table, in Markdown; nothing for a scene of which the paper prints nothing.
 
     Scenes are known by name, in upper or lower case: downloads differ in that.
     """
@@ -19,11 +21,12 @@ def reported_table(scene: str) -> tuple[str, list[list[str]]] | None:
 
     rows = [row for row in paper_rows() if row["scene_set"] == scene.lower()]
     if not rows:
-        return None
-    title = f"As the paper reports it ({rows[0]['source']}), by its own unpublished scorer and not by this protocol:"
-    lines = [["Method", *(METRICS[name].label for name in _FIGURES)], ["---", *["---:"] * len(_FIGURES)]]
-    for row in rows:
-        values = (row[name] for name in _FIGURES)
-        cells = [format_value(n, v if isinstance(v, float) else None, "–") for n, v in zip(_FIGURES, values)]
-        lines.append([str(row["method"]), *cells])
-    return title, lines
+        return []
+    figures = {
+        label(metric): [shown(metric, value if isinstance(value := row[metric.name], float) else None) for row in rows]
+        for metric in _FIGURES
+    }
+    return [
+        f"As the paper reports it ({rows[0]['source']}), by its own unpublished scorer and not by this protocol:",
+        table({"Method": [str(row["method"]) for row in rows], **figures}, right=figures),
+    ]

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from splashbench.errors import SplashbenchError
 from splashbench.score.result import Result
 
-#: Figures that are charted, with the least each can be; no figure comes near the most.
+#: Figures that are charted, with the least each can be; no figure comes near the largest.
 _CHARTED = {"psnr": -1e15, "lpips": 0.0, "miou": 0.0, "fit_seconds": 0.0}
-_MOST = 1e15
+_CHARTED_MAX = 1e15
 
 
 @dataclass(frozen=True)
-class Source:
+class ResultFile:
     """A result and the file it came from (relative to the folder read)."""
 
     path: str
     result: Result
 
 
-def load_results(location: Path) -> list[Source]:
+def load_results(location: Path) -> list[ResultFile]:
     """Every result (*.json) below the folder `location`, or the one file, in one order on every machine.
 
     A submission scored twice by the same protocol counts once: the result with more figures (one scored with a
@@ -40,25 +37,25 @@ def load_results(location: Path) -> list[Source]:
     if not files:
         raise SplashbenchError(f"{location} holds no results (*.json); make some with `splashbench score`")
     root = location.parent if location.is_file() else location
-    kept: dict[tuple[str, ...], Source] = {}
+    by_digests: dict[tuple[str, ...], ResultFile] = {}
     for path in files:
-        source = Source(path.relative_to(root).as_posix(), _plausible(path, Result.load(path)))
+        source = ResultFile(path.relative_to(root).as_posix(), _plausible(path, Result.load(path)))
         digests = source.result.digests
         key = (digests.scene, digests.submission, digests.protocol)
-        if key not in kept or _known(source.result) > _known(kept[key].result):
-            kept[key] = source
-    sources = sorted(kept.values(), key=lambda source: (*_order(source.result), source.path))
+        if key not in by_digests or _known(source.result) > _known(by_digests[key].result):
+            by_digests[key] = source
+    sources = sorted(by_digests.values(), key=lambda source: (*_order(source.result), source.path))
     _refuse_repeats(sources)
     return sources
 
 
-def _refuse_repeats(sources: list[Source]) -> None:
+def _refuse_repeats(sources: list[ResultFile]) -> None:
     """Two submissions of one method, settings, scene and seed are an old and a new run, not a spread over seeds."""
-    seen: dict[tuple[str, ...], Source] = {}
+    seen: dict[tuple[str, ...], ResultFile] = {}
     for source in sources:
         result = source.result
         same = (result.digests.scene, result.protocol_label, result.method, result.preset)
-        key = (*same, str(result.seed), settings_digest(result), hardware_label(result.hardware))
+        key = (*same, str(result.seed), result.settings_digest, result.hardware_label)
         if key in seen:
             raise SplashbenchError(
                 f"{seen[key].path} and {source.path} are two runs of {result.method} with one seed and the same "
@@ -71,7 +68,7 @@ def _plausible(path: Path, result: Result) -> Result:
     """`result`, unless a figure is one that no score has and no chart can hold."""
     for name, least in _CHARTED.items():
         value = result.value(name)
-        if value is not None and not least <= value <= _MOST:
+        if value is not None and not least <= value <= _CHARTED_MAX:
             raise SplashbenchError(f"{path}: metrics.{name} is {value:g}, which no run has; score the submission again")
     return result
 
@@ -82,17 +79,3 @@ def _known(result: Result) -> int:
 
 def _order(result: Result) -> tuple[str, str, str, int]:
     return (result.scene, result.method, result.preset, result.seed)
-
-
-def settings_digest(result: Result) -> str:
-    """Eight hex digits naming the method's version and settings: runs that differ in them are never averaged."""
-    text = json.dumps([result.method_version, result.settings], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-def hardware_label(hardware: dict[str, Any]) -> str:
-    """One line for the machine a run was measured on; runs of different lines never share a speed chart."""
-    parts = [str(hardware[key]) for key in ("gpu", "device", "cpu") if hardware.get(key)]
-    if hardware.get("cores"):
-        parts.append(f"{hardware['cores']} core{'' if hardware['cores'] == 1 else 's'}")
-    return ", ".join(parts) or "hardware not recorded"

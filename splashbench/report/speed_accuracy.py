@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.report.results import Source, hardware_label, settings_digest
+from splashbench.report.results import ResultFile
 from splashbench.score.result import Result
 
 _BOOTSTRAP_SAMPLES = 2000
@@ -30,7 +30,7 @@ class Dot:
 
 
 @dataclass
-class Entry:
+class ChartedMethod:
     """A method with its settings on one machine. mixed: see docs/protocol.md, "Mixed methods"."""
 
     label: str
@@ -69,7 +69,7 @@ class Machine:
     title: str
     n_scenes: int = 1
     reported: bool = False
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[ChartedMethod] = field(default_factory=list)
     controls: dict[str, dict[str, float]] = field(default_factory=dict)
     failures: Counter[str] = field(default_factory=Counter)
 
@@ -113,21 +113,21 @@ def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) 
     return front
 
 
-def machines(sources: Sequence[Source]) -> list[Machine]:
+def machines(sources: Sequence[ResultFile]) -> list[Machine]:
     """The measured results by machine and protocol, in order of name; controls and failed runs set apart, none dropped.
 
     Figures of a changed protocol are other figures: they never share a panel with v1's.
     """
     by_machine: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for source in sources:
-        by_machine[hardware_label(source.result.hardware), source.result.protocol_label].append(source.result)
+        by_machine[source.result.hardware_label, source.result.protocol_label].append(source.result)
     return [_machine(title, protocol, results) for (title, protocol), results in sorted(by_machine.items())]
 
 
 def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
     scenes = len({result.digests.scene for result in results})
     machine = Machine(f"{title} · {scenes} scene{'' if scenes == 1 else 's'}, protocol {protocol}", scenes)
-    entries: dict[str, Entry] = {}
+    entries: dict[str, ChartedMethod] = {}
     controls: dict[str, list[dict[str, float]]] = defaultdict(list)
     names = _labels(results)
     for result in results:
@@ -142,7 +142,7 @@ def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
         else:
             label = names[_key(result)]
             memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
-            entry = entries.setdefault(label, Entry(label, result.mixed))
+            entry = entries.setdefault(label, ChartedMethod(label, result.mixed))
             entry.dots.append(Dot(seconds, values, memory))
             entry.scenes.add(result.digests.scene)
     machine.entries = [entries[label] for label in sorted(entries)]
@@ -155,7 +155,7 @@ def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
 
 
 def _key(result: Result) -> tuple[str, str, str]:
-    return (result.method, result.preset, settings_digest(result))
+    return (result.method, result.preset, result.settings_digest)
 
 
 def _labels(results: list[Result]) -> dict[tuple[str, str, str], str]:
@@ -182,6 +182,6 @@ def reported_machine() -> Machine:
         values = {name: value for name in ("psnr", "lpips") if isinstance(value := row[name], float)}
         memory = row["memory_gib"]
         bytes_ = memory * 2**30 if isinstance(memory, float) else None
-        machine.entries.append(Entry(str(row["method"]), dots=[Dot(minutes * 60, values, bytes_)]))
+        machine.entries.append(ChartedMethod(str(row["method"]), dots=[Dot(minutes * 60, values, bytes_)]))
         machine.title = f"{row['hardware']} by the paper · means over {row['scene_set']}"
     return machine

@@ -44,12 +44,6 @@ class Metric:
         """
         return self.group in ("particles", "truth") or self.name in ("spill", "miou", "particles_per_frame")
 
-    @property
-    def label(self) -> str:
-        """Title with unit and arrow, for a table's head."""
-        arrow = {"higher": " ↑", "lower": " ↓", None: ""}[self.better]
-        return f"{self.title}{f' ({self.unit})' if self.unit else ''}{arrow}"
-
 
 _PAPER = "paper, Metrics"
 _SUPPLEMENT = "paper, supplement, Evaluation Protocol"
@@ -90,24 +84,5 @@ METRICS: dict[str, Metric] = {
     )
 }
 
-
-#: The figures against true particles, which made-up scenes alone have.
+#: The figures against true particles, which synthetic scenes alone have.
 TRUTH_METRICS = tuple(name for name, metric in METRICS.items() if metric.group == "truth")
-
-
-#: Stands behind figures of mixed methods that rest on the filter, or behind the methods' names in a chart's legend.
-FILTER_MARK = "†"
-FILTER_NOTE = (
-    f"{FILTER_MARK} One set of primitives is background and liquid. The figure is of those alone that lie inside the "
-    "silhouettes of all training views: a filter, no part of the method. It loses liquid that only some views see."
-)
-
-
-def filter_mark(metric: Metric, mixed: bool, value: float | None) -> str:
-    """What stands behind `value` of `metric`; mixed: whether the method is."""
-    return FILTER_MARK if mixed and metric.filtered and value is not None else ""
-
-
-def format_value(name: str, value: float | None, missing: str = "") -> str:
-    """`value` of metric `name` with the registry's decimals; `missing` where there is none."""
-    return missing if value is None else f"{value:.{METRICS[name].decimals}f}"

@@ -7,6 +7,7 @@ and never a score. Results name by digest what they were computed from.
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from pathlib import Path
 from typing import Any, Literal
@@ -97,6 +98,21 @@ class Result(_Frozen):
     def protocol_label(self) -> str:
         """What results must share to be compared: the protocol, and whether timesteps were withheld."""
         return f"{self.protocol.label}, {self.withheld} timesteps withheld" if self.withheld else self.protocol.label
+
+    @property
+    def settings_digest(self) -> str:
+        """Eight hex digits naming the method's version and settings: runs that differ in them are never averaged."""
+        text = json.dumps([self.method_version, self.settings], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+    @property
+    def hardware_label(self) -> str:
+        """One line for the machine a run was measured on; runs of different lines never share a speed chart."""
+        parts = [str(self.hardware[key]) for key in ("gpu", "device", "cpu") if self.hardware.get(key)]
+        cores = self.hardware.get("cores")
+        if cores:
+            parts.append(f"{cores} core{'' if cores == 1 else 's'}")
+        return ", ".join(parts) or "hardware not recorded"
 
     @property
     def file_name(self) -> str:

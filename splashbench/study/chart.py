@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splashbench.files import atomic_path
-from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
-from splashbench.study.formatting import label, scaled
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, in_shown_unit, label
 from splashbench.study.spec import metric_of
-from splashbench.study.table import Row, Table
+from splashbench.study.table import Table, TableRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +74,7 @@ def draw_chart(table: Table, out: Path) -> list[Path]:
 
 def _panel(axes: Axes, table: Table, name: str, reported: bool, named: bool) -> None:
     better = {"higher": ", higher is better →", "lower": ", ← lower is better", None: ""}[metric_of(name).better]
-    title = f"{label(name, arrow=False)}{', as the paper reports' if reported else better}"
+    title = f"{label(metric_of(name), arrow=False)}{', as the paper reports' if reported else better}"
     axes.set_title(textwrap.fill(title, _TITLE_LETTERS))
     values = {row.name: _value(row, name, reported) for row in table.rows}
     baseline = values[table.plan.spec.baseline]
@@ -109,7 +108,7 @@ def _panel(axes: Axes, table: Table, name: str, reported: bool, named: bool) -> 
     _no_axis_without_values(axes, values)
 
 
-def _limits(rows: list[Row], name: str, reported: bool) -> tuple[float, float]:
+def _limits(rows: list[TableRow], name: str, reported: bool) -> tuple[float, float]:
     """Between which a control is drawn to scale: it may widen the axis to three times what the rows take up."""
     known = [value for row in rows if (value := _value(row, name, reported)) is not None]
     if not known:
@@ -132,9 +131,9 @@ def _write_at_edge(axes: Axes, text: str, y: int, right: bool = False) -> None:
     )
 
 
-def _name(row: Row, reported: bool) -> str:
+def _name(row: TableRow, reported: bool) -> str:
     """The row's name, and how many of its runs came through where some did not: no failure may vanish from a chart."""
-    return row.name if reported or row.whole else f"{row.name} ({row.count('ok')} of {len(row.runs)} runs)"
+    return row.name if reported or row.complete else f"{row.name} ({row.count('ok')} of {len(row.runs)} runs)"
 
 
 def _no_axis_without_values(axes: Axes, values: Mapping[str, float | None]) -> None:
@@ -142,22 +141,22 @@ def _no_axis_without_values(axes: Axes, values: Mapping[str, float | None]) -> N
         axes.set_xticks([])
 
 
-def _value(row: Row, name: str, reported: bool) -> float | None:
+def _value(row: TableRow, name: str, reported: bool) -> float | None:
     value = row.paper.get(name) if reported else row.cells[name].mean
-    return None if value is None else scaled(name, value)
+    return None if value is None else in_shown_unit(metric_of(name), value)
 
 
-def _draw_seeds(axes: Axes, row: Row, name: str, y: int, colour: str) -> None:
+def _draw_seeds(axes: Axes, row: TableRow, name: str, y: int, colour: str) -> None:
     cell = row.cells[name]
-    seeds = [scaled(name, value) for value in cell.seeds]
+    seeds = [in_shown_unit(metric_of(name), value) for value in cell.seeds]
     if len(seeds) < 2 or cell.mean is None or cell.std is None:
         return
     axes.scatter(seeds, [y + 0.27] * len(seeds), s=9, color=colour, alpha=0.6, linewidths=0, zorder=2)
-    ends = [scaled(name, cell.mean - cell.std), scaled(name, cell.mean + cell.std)]
+    ends = [in_shown_unit(metric_of(name), cell.mean - cell.std), in_shown_unit(metric_of(name), cell.mean + cell.std)]
     axes.plot(ends, [y, y], color=colour, linewidth=1.4, solid_capstyle="butt", zorder=3)
 
 
-def _why(row: Row) -> str:
+def _why(row: TableRow) -> str:
     """Why a row has no mean."""
     if row.failed:
         return f"✕ failed: {', '.join(sorted({run.status for run in row.failed}))}"

@@ -22,15 +22,15 @@ from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import require_folder_place, write_model, write_text
 from splashbench.harness.messages import DISK_FULL_EXIT
 from splashbench.score.image.lpips import load_lpips
-from splashbench.study.job import ERROR, Entry, Job, Store, carry_out
-from splashbench.study.plan import Plan, Planned
+from splashbench.study.job import ERROR, Job, RunEntry, Store, carry_out
+from splashbench.study.plan import Plan, PlannedRun
 
 _MARK = ".splashbench_study"
 _POLL_SECONDS = 0.1
 
 
 @dataclass
-class Options:
+class ExecutionOptions:
     """How a plan is carried out.
 
     Attributes:
@@ -58,7 +58,7 @@ class Tally:
     kept: int = 0
 
 
-def carry_out_plan(plan: Plan, out: Path, options: Options) -> Tally:
+def carry_out_plan(plan: Plan, out: Path, options: ExecutionOptions) -> Tally:
     """Make every run of `plan` that is not in the folder `out` yet.
 
     Raises SplashbenchError where `out` is another's, or another process is at it, or the disk is full.
@@ -84,7 +84,7 @@ def carry_out_plan(plan: Plan, out: Path, options: Options) -> Tally:
         return Tally(total, len({run.digest for run in chosen}) - len(missing))
 
 
-def _is_missing(run: Planned, store: Store, with_lpips: bool, retry: bool) -> bool:
+def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) -> bool:
     """Whether the run is to be made: it is not there, or it lacks a figure that can be had by now."""
     entry = store.entry(run.digest)
     if entry is None or entry.status == ERROR:
@@ -99,7 +99,7 @@ def _is_missing(run: Planned, store: Store, with_lpips: bool, retry: bool) -> bo
     )
 
 
-def _job(plan: Plan, run: Planned, out: Path, options: Options, is_reference: bool) -> Job:
+def _job(plan: Plan, run: PlannedRun, out: Path, options: ExecutionOptions, is_reference: bool) -> Job:
     return Job(
         digest=run.digest,
         title=f"{run.scene.name}__{run.variant.name}__seed{run.seed}__{run.digest[:8]}",
@@ -130,7 +130,7 @@ def _seconds_before(plan: Plan, store: Store) -> list[float]:
 class _Progress:
     """Says before each run which it is and about how long the rest takes."""
 
-    def __init__(self, total: int, options: Options, seconds: list[float]) -> None:
+    def __init__(self, total: int, options: ExecutionOptions, seconds: list[float]) -> None:
         self._total, self._jobs, self._tell = total, options.jobs, options.tell
         self._seconds, self._started, self._ended = seconds, 0, 0
 
@@ -142,7 +142,7 @@ class _Progress:
             left = f", about {duration(mean * (self._total - self._ended) / self._jobs)} left"
         self._tell(f"run {self._started} of {self._total}{left}: {job.title}")
 
-    def ends(self, entry: Entry) -> None:
+    def ends(self, entry: RunEntry) -> None:
         self._ended += 1
         self._seconds.append(entry.seconds)
         if entry.status != "ok":
@@ -195,7 +195,7 @@ class _Worker:
     def has_ended(self) -> bool:
         return self._process.poll() is not None
 
-    def entry(self) -> Entry:
+    def entry(self) -> RunEntry:
         """What the process wrote, or that it ended without."""
         if self._process.returncode == 0:
             entry = self._store.entry(self._job.digest)
@@ -206,7 +206,7 @@ class _Worker:
         if self._process.returncode == DISK_FULL_EXIT:
             raise DiskFullError(last)
         reason = f"the run's process ended with exit code {self._process.returncode}: {last}"
-        entry = Entry(digest=self._job.digest, title=self._job.title, status=ERROR, reason=reason)
+        entry = RunEntry(digest=self._job.digest, title=self._job.title, status=ERROR, reason=reason)
         write_model(self._store.entry_path(self._job.digest), entry)
         return entry
 

@@ -21,7 +21,7 @@ from splashbench.processes import end_with_parent, terminable
 from splashbench.scene import Scene
 from splashbench.score import Result, score_submission, shared_fields
 from splashbench.study.scenes import changed_scene
-from splashbench.study.spec import Variant
+from splashbench.study.spec import StudyVariant
 from splashbench.submission import Record, Status, Submission
 
 #: The status of a run that ended outside its method: in reading the scene, say, or in scoring.
@@ -35,7 +35,7 @@ class Job(BaseModel):
     digest: str
     title: str
     scene: str
-    variant: Variant
+    variant: StudyVariant
     seed: int
     method: str
     preset: str
@@ -51,7 +51,7 @@ class Job(BaseModel):
     at_once: int
 
 
-class Entry(BaseModel):
+class RunEntry(BaseModel):
     """runs/DIGEST.json: a run that is done. `result` is its file in results/, null where there is none to score.
 
     at_once: how many runs shared the machine. seconds: all that the run took here, scoring included.
@@ -78,15 +78,15 @@ class Store:
         self.results, self.runs, self.submissions = self.out / "results", self.out / "runs", self.out / "submissions"
         self.cache = self.out / "cache"
 
-    def entry(self, digest: str) -> Entry | None:
+    def entry(self, digest: str) -> RunEntry | None:
         """The entry of the run `digest` and None where there is none that is whole."""
         path = self.entry_path(digest)
         if not path.is_file():
             return None
-        entry = read_model(path, Entry)
+        entry = read_model(path, RunEntry)
         return entry if entry.result is None or (self.results / entry.result).is_file() else None
 
-    def result(self, entry: Entry) -> Result | None:
+    def result(self, entry: RunEntry) -> Result | None:
         """The result of an entry, None where it has none."""
         return Result.load(self.results / entry.result) if entry.result else None
 
@@ -106,13 +106,13 @@ class Store:
         return submission if submission.status == Status.OK else None
 
 
-def carry_out(job: Job) -> Entry:
+def carry_out(job: Job) -> RunEntry:
     """Make the run, score it, and write both down. What goes wrong is an entry with a status and a reason.
 
     Raises DiskFullError alone: then no other run would come through either.
     """
     store, start = Store(Path(job.out)), time.monotonic()
-    done = Entry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once)
+    done = RunEntry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once)
     try:
         done = _scored(job, store, done)
     except DiskFullError:
@@ -129,7 +129,7 @@ def carry_out(job: Job) -> Entry:
     return done
 
 
-def _scored(job: Job, store: Store, entry: Entry) -> Entry:
+def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     original = Scene.open(Path(job.scene))
     scene = changed_scene(original, job.variant, job.seed, store.cache / "scenes")
     place = store.reference_path(job.digest) if job.is_reference else store.submissions / job.title

@@ -20,11 +20,11 @@ from splashbench.harness.runner import TIMING_FRAMES, without_nulls
 from splashbench.scene import Scene
 from splashbench.score import PROTOCOL_V1
 from splashbench.study.scenes import changes
-from splashbench.study.spec import StudySpec, Variant
+from splashbench.study.spec import StudySpec, StudyVariant
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedScene:
     """A scene under the name that the study's tables give it."""
 
     name: str
@@ -32,7 +32,7 @@ class Named:
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedRun:
     """A run of the study.
 
     Attributes:
@@ -44,8 +44,8 @@ class Planned:
         control: whether the method is a control.
     """
 
-    scene: Named
-    variant: Variant
+    scene: NamedScene
+    variant: StudyVariant
     seed: int
     digest: str
     method: str
@@ -63,12 +63,12 @@ class Plan:
     spec: StudySpec
     method: Method
     preset: str
-    scenes: tuple[Named, ...]
-    references: tuple[Planned, ...]
-    runs: tuple[Planned, ...]
+    scenes: tuple[NamedScene, ...]
+    references: tuple[PlannedRun, ...]
+    runs: tuple[PlannedRun, ...]
 
     @property
-    def reference_row(self) -> tuple[Planned, ...]:
+    def reference_row(self) -> tuple[PlannedRun, ...]:
         """The reference on the scenes as they are."""
         return tuple(run for run in self.references if not run.variant.perturbation and run.variant.train_views is None)
 
@@ -81,8 +81,8 @@ def make_plan(spec: StudySpec) -> Plan:
     rows = {variant.name: _row(spec, variant) for variant in spec.variants}
     scenes = _open_scenes(spec)
     timing = TIMING_FRAMES if "render_fps" in spec.metrics else 0
-    references: dict[str, Planned] = {}
-    runs: list[Planned] = []
+    references: dict[str, PlannedRun] = {}
+    runs: list[PlannedRun] = []
     for seed in spec.seeds:
         for scene in scenes:
             for variant in spec.variants:
@@ -91,7 +91,7 @@ def make_plan(spec: StudySpec) -> Plan:
                     references.setdefault(reference.digest, reference)
                 row = rows[variant.name]
                 runs.append(
-                    Planned(
+                    PlannedRun(
                         scene,
                         variant,
                         seed,
@@ -109,7 +109,7 @@ def make_plan(spec: StudySpec) -> Plan:
     return Plan(spec, own, preset, scenes, tuple(references.values()), tuple(runs))
 
 
-class _Row(NamedTuple):
+class _MethodChoice(NamedTuple):
     """What a variant runs: a method under the name it was given, its preset, what is set on it, and all settings."""
 
     method: Method
@@ -119,7 +119,7 @@ class _Row(NamedTuple):
     resolved: dict[str, Any]
 
 
-def _row(spec: StudySpec, variant: Variant) -> _Row:
+def _row(spec: StudySpec, variant: StudyVariant) -> _MethodChoice:
     name = variant.method or spec.method
     method = load_method(name)
     if spec.device not in method.devices:
@@ -128,17 +128,17 @@ def _row(spec: StudySpec, variant: Variant) -> _Row:
     own = variant.method is None
     preset = variant.preset or (spec.preset if own else None) or next(iter(method.Config.presets))
     overrides, resolved = _checked(spec, method, variant.name, preset, variant.settings, with_base=own)
-    return _Row(method, name, preset, overrides, resolved)
+    return _MethodChoice(method, name, preset, overrides, resolved)
 
 
-def _open_scenes(spec: StudySpec) -> tuple[Named, ...]:
-    scenes: list[Named] = []
+def _open_scenes(spec: StudySpec) -> tuple[NamedScene, ...]:
+    scenes: list[NamedScene] = []
     for entry in spec.scenes:
         scene = Scene.open(Path(entry.path))
         name = entry.name or scene.name
         if name in [other.name for other in scenes]:
             raise SplashbenchError(f"study {spec.name}: two scenes are called {name!r}; give one another name")
-        scenes.append(Named(name, scene))
+        scenes.append(NamedScene(name, scene))
     return tuple(scenes)
 
 
@@ -154,7 +154,7 @@ def _checked(
     return overrides, without_nulls(config.model_dump(mode="json"))
 
 
-def _reference(spec: StudySpec, scene: Named, variant: Variant, seed: int, timing: int) -> Planned | None:
+def _reference(spec: StudySpec, scene: NamedScene, variant: StudyVariant, seed: int, timing: int) -> PlannedRun | None:
     if spec.reference is None:
         return None
     wanted = spec.reference
@@ -162,17 +162,23 @@ def _reference(spec: StudySpec, scene: Named, variant: Variant, seed: int, timin
     preset = wanted.preset or next(iter(method.Config.presets))
     overrides, resolved = _checked(spec, method, wanted.method, preset, wanted.settings, with_base=False)
     changed = changes(scene.scene, variant, seed) is not None
-    row = Variant(
+    row = StudyVariant(
         name=wanted.method,
         perturbation=variant.perturbation if changed else (),
         train_views=variant.train_views if changed else None,
     )
     digest = _digest(method, preset, resolved, seed, "cpu", scene.scene, row)
-    return Planned(scene, row, seed, digest, wanted.method, preset, overrides, None, timing, method.control)
+    return PlannedRun(scene, row, seed, digest, wanted.method, preset, overrides, None, timing, method.control)
 
 
 def _digest(
-    method: Method, preset: str, settings: Mapping[str, Any], seed: int, device: str, scene: Scene, variant: Variant
+    method: Method,
+    preset: str,
+    settings: Mapping[str, Any],
+    seed: int,
+    device: str,
+    scene: Scene,
+    variant: StudyVariant,
 ) -> str:
     said = {
         "method": [method.id, method.version],

@@ -1,17 +1,17 @@
-"""A study's table as CSV and JSON, for programs; runs.csv has every run by itself."""
+"""A study's files: Markdown and a chart for people, CSV and JSON for programs; runs.csv has every run by itself."""
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from splashbench.files import files_together, write_json, write_text
 from splashbench.study.chart import draw_chart
-from splashbench.study.markdown import to_markdown
 from splashbench.study.spec import metric_of
 from splashbench.study.table import NOT_RUN, Table
+from splashbench.study.table_markdown import to_markdown
 
 
 def write_report(table: Table, out: Path, command: str) -> list[Path]:
@@ -30,38 +30,23 @@ def table_csv(table: Table) -> str:
 
     mixed: of a mixed method, whose filtered figures rest on the protocol's filter (docs/protocol.md).
     """
-    metrics = table.plan.spec.metrics
-    suffixes = ("", "_std", "_difference", "_difference_std")
-    figures = [f"{name}{suffix}" for name in metrics for suffix in suffixes]
-    lines = [["variant", "runs", "failed", "not_run", *figures, "mixed"]]
-    for row in table.rows:
-        line = [row.name, str(row.count("ok")), str(len(row.failed)), str(row.count(NOT_RUN))]
-        for name in metrics:
-            cell = row.cells[name]
-            for value in (cell.mean, cell.std, cell.difference, cell.difference_std):
-                line.append(_exact(value))
-        lines.append([*line, str(row.mixed).lower()])
-    return _csv(lines)
+    counts = pd.DataFrame(
+        [
+            {"variant": row.name, "runs": row.count("ok"), "failed": len(row.failed), "not_run": row.count(NOT_RUN)}
+            for row in table.rows
+        ]
+    )
+    mixed = {row.name: str(row.mixed).lower() for row in table.rows}
+    return _csv(counts.join(table.figures, on="variant").assign(mixed=counts["variant"].map(mixed)))
 
 
 def runs_csv(table: Table) -> str:
-    """A row per run. reused_seconds: of fit_seconds, what was spent in an earlier run of the study."""
-    metrics = table.plan.spec.metrics
-    lines = [
-        ["scene", "variant", "seed", "status", "reason", *metrics, "reused_seconds", "runs_at_once", "digest", "mixed"]
-    ]
-    for run in table.runs:
-        record = run.entry.record if run.entry else None
-        reused = sum(record.reused.values()) if record and record.reused else None
-        lines.append(
-            [
-                *(run.planned.scene.name, run.planned.variant.name, str(run.planned.seed), run.status, run.reason),
-                *(_exact(run.values[name]) for name in metrics),
-                *(_exact(reused), str(run.entry.at_once) if run.entry else "", run.planned.digest[:16]),
-                str(run.result.mixed).lower() if run.result else "",
-            ]
-        )
-    return _csv(lines)
+    """A row per run; see `Table.run_frame`."""
+    return _csv(table.run_frame)
+
+
+def _csv(frame: pd.DataFrame) -> str:
+    return str(frame.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
 def as_json(table: Table, command: str) -> dict[str, Any]:
@@ -98,13 +83,3 @@ def as_json(table: Table, command: str) -> dict[str, Any]:
             for row in table.rows
         ],
     }
-
-
-def _exact(value: float | None) -> str:
-    return "" if value is None else f"{value:.9g}"
-
-
-def _csv(lines: list[list[str]]) -> str:
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows(lines)
-    return stream.getvalue()

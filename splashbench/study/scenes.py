@@ -23,14 +23,14 @@ from splashbench.scene.container import mesh_path
 from splashbench.scene.layout import plain_name
 from splashbench.scene.source import ReleasedSource
 from splashbench.study.perturbation import Perturbation, direction_of_loss, without_part
-from splashbench.study.spec import Variant
+from splashbench.study.spec import StudyVariant
 from splashbench.study.view_subsets import nested_views
 
 #: Raised when a change alters the copies that the same description gives.
 _VERSION = 1
 
 
-def changes(scene: Scene, variant: Variant, seed: int) -> dict[str, Any] | None:
+def changes(scene: Scene, variant: StudyVariant, seed: int) -> dict[str, Any] | None:
     """How the scene of `variant`'s run differs from `scene`, in JSON's terms; None where it does not.
 
     Raises SplashbenchError where the scene cannot be changed so.
@@ -55,7 +55,7 @@ def _named_views(scene: Scene, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in scene.train if name in names)
 
 
-def changed_scene(scene: Scene, variant: Variant, seed: int, cache: Path) -> Scene:
+def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -> Scene:
     """`scene` as `variant` has it: itself, or its copy in the folder `cache`, made there where it is not yet."""
     said = changes(scene, variant, seed)
     if said is None:

@@ -43,7 +43,7 @@ class SceneEntry(_Model):
     name: str | None = Field(default=None, pattern=_NAME)
 
 
-class Variant(_Model):
+class StudyVariant(_Model):
     """One row of the table: what it changes. `paper`: its name in leaderboards/paper.csv.
 
     method: another one than the study's, with its own preset (the first, unless named) and settings; `base` is not its.
@@ -92,7 +92,7 @@ class StudySpec(_Model):
     seeds: tuple[NonNegativeInt, ...] = Field(default=(0, 1, 2), min_length=1)
     metrics: tuple[str, ...] = Field(min_length=1)
     baseline: str
-    variants: tuple[Variant, ...] = Field(min_length=1)
+    variants: tuple[StudyVariant, ...] = Field(min_length=1)
     reference: Reference | None = Reference()
     paper: Paper | None = None
     device: str = "cpu"
@@ -139,7 +139,7 @@ class StudySpec(_Model):
         """Of the variants, in order."""
         return [variant.name for variant in self.variants]
 
-    def variant(self, name: str) -> Variant:
+    def variant(self, name: str) -> StudyVariant:
         """The variant called `name`. Raises SplashbenchError where there is none."""
         for variant in self.variants:
             if variant.name == name:

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean, stdev
 from typing import Any
 
+import pandas as pd
+
 from splashbench.score import Result
-from splashbench.study.job import Entry, Store
-from splashbench.study.plan import Plan, Planned
-from splashbench.study.spec import DERIVED, metric_of
+from splashbench.study.job import RunEntry, Store
+from splashbench.study.plan import Plan, PlannedRun
+from splashbench.study.spec import DERIVED, StudySpec, metric_of
 
 #: The status of a run that has not been made.
 NOT_RUN = "not run"
+#: A metric's columns in table.csv: its name with each of these behind it.
+SUFFIXES = ("", "_std", "_difference", "_difference_std")
 #: Column of leaderboards/paper.csv for a metric, and what turns its unit into the metric's.
 _PAPER_COLUMNS = {
     "psnr": ("psnr", 1.0),
@@ -37,13 +40,12 @@ _PAPER_COLUMNS = {
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run of the plan and what is known of it; `values` has every metric of the study."""
+class StudyRun:
+    """A run of the plan, with its entry and result where it has been made."""
 
-    planned: Planned
-    entry: Entry | None
+    planned: PlannedRun
+    entry: RunEntry | None
     result: Result | None
-    values: Mapping[str, float | None]
 
     @property
     def status(self) -> str:
@@ -53,12 +55,22 @@ class Run:
     def reason(self) -> str:
         return self.entry.reason if self.entry else ""
 
+    def value(self, metric: str) -> float | None:
+        """The run's figure; None where it has none, and of runs that failed."""
+        if self.result is None or self.result.status != "ok":
+            return None
+        if metric in DERIVED:
+            _, over, under = DERIVED[metric]
+            top, bottom = self.result.value(over), self.result.value(under)
+            return top / bottom if top is not None and bottom else None
+        return self.result.value(metric)
+
 
 @dataclass(frozen=True)
 class Cell:
     """One figure of a row; None where it cannot be said.
 
-    mean, std: over seeds, of the means over scenes; seeds: how many. difference, difference_std: to the baseline.
+    mean, std: over seeds, of the means over scenes; seeds: these means. difference, difference_std: to the baseline.
     """
 
     mean: float | None
@@ -69,7 +81,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A variant, or the reference: its runs and a cell for each metric. `paper`: what the paper reports of it.
 
     control: whether it is of a method that is a control, as the reference is.
@@ -78,7 +90,7 @@ class Row:
     name: str
     note: str
     control: bool
-    runs: tuple[Run, ...]
+    runs: tuple[StudyRun, ...]
     cells: Mapping[str, Cell]
     paper: Mapping[str, float]
 
@@ -87,7 +99,7 @@ class Row:
         return sum(run.status in statuses for run in self.runs)
 
     @property
-    def failed(self) -> tuple[Run, ...]:
+    def failed(self) -> tuple[StudyRun, ...]:
         return tuple(run for run in self.runs if run.status not in ("ok", NOT_RUN))
 
     @property
@@ -96,17 +108,26 @@ class Row:
         return any(run.result is not None and run.result.mixed for run in self.runs)
 
     @property
-    def whole(self) -> bool:
+    def complete(self) -> bool:
         """Whether every run of the row came through."""
         return self.count("ok") == len(self.runs)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
-    """A study's outcome. `scenes_of`: the scenes a metric is averaged over, by name."""
+    """A study's outcome.
+
+    Attributes:
+        rows: variants in the spec's order, then the reference.
+        run_frame: a row per run, the columns of runs.csv.
+        figures: indexed by row name; a column for each metric with each of SUFFIXES, NaN where there is no figure.
+        scenes_of: the scenes that a metric is averaged over, by name.
+    """
 
     plan: Plan
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
+    run_frame: pd.DataFrame
+    figures: pd.DataFrame
     scenes_of: Mapping[str, tuple[str, ...]]
 
     @property
@@ -116,97 +137,99 @@ class Table:
         return named and any(row.mixed for row in self.rows)
 
     @property
-    def runs(self) -> tuple[Run, ...]:
+    def runs(self) -> tuple[StudyRun, ...]:
         return tuple(run for row in self.rows for run in row.runs)
 
     @property
-    def baseline(self) -> Row:
+    def baseline(self) -> TableRow:
         return next(row for row in self.rows if row.name == self.plan.spec.baseline)
 
 
 def make_table(plan: Plan, store: Store) -> Table:
     """The table of what is in `store` by now."""
     spec = plan.spec
-    paper = _paper_figures(plan)
-    groups = [(v.name, v.note, [run for run in plan.runs if run.variant.name == v.name]) for v in spec.variants]
+    planned = {v.name: (v.note, [run for run in plan.runs if run.variant.name == v.name]) for v in spec.variants}
     if plan.reference_row:
-        name = plan.reference_row[0].variant.name
-        groups.append((name, "control: the background alone", list(plan.reference_row)))
-    made = {name: tuple(_run(planned, store, spec.metrics) for planned in runs) for name, _, runs in groups}
+        planned[plan.reference_row[0].variant.name] = ("control: the background alone", list(plan.reference_row))
+    runs = {name: tuple(_study_run(run, store) for run in row) for name, (_, row) in planned.items()}
+    run_frame = _run_frame([run for row in runs.values() for run in row], spec.metrics)
     scenes_of = {
-        metric: tuple(
-            scene.name
-            for scene in plan.scenes
-            if any(r.values[metric] is not None for runs in made.values() for r in runs if r.planned.scene is scene)
-        )
+        metric: tuple(s.name for s in plan.scenes if s.name in set(run_frame["scene"][run_frame[metric].notna()]))
         for metric in spec.metrics
     }
-    by_seed = {
-        name: {metric: _scene_means(runs, metric, scenes_of[metric]) for metric in spec.metrics}
-        for name, runs in made.items()
-    }
+    means = _scene_means(run_frame, scenes_of)
+    figures = _figures(means, spec.baseline)
+    paper = _paper_figures(spec)
     rows = [
-        Row(
-            name,
-            note,
-            made[name][0].planned.control,
-            made[name],
-            {
-                m: _cell(by_seed[name][m], None if name == spec.baseline else by_seed[spec.baseline][m])
-                for m in spec.metrics
-            },
-            paper.get(name, {}),
+        TableRow(
+            name=name,
+            note=note,
+            control=runs[name][0].planned.control,
+            runs=runs[name],
+            cells={metric: _cell(metric, figures.loc[name], means.loc[name]) for metric in spec.metrics},
+            paper=paper.get(name, {}),
         )
-        for name, note, _ in groups
+        for name, (note, _) in planned.items()
     ]
-    return Table(plan, tuple(rows), scenes_of)
+    return Table(plan, tuple(rows), run_frame, figures, scenes_of)
 
 
-def _run(planned: Planned, store: Store, metrics: Sequence[str]) -> Run:
+def _study_run(planned: PlannedRun, store: Store) -> StudyRun:
     entry = store.entry(planned.digest)
-    result = store.result(entry) if entry else None
-    return Run(planned, entry, result, {name: _value(result, name) for name in metrics})
+    return StudyRun(planned, entry, store.result(entry) if entry else None)
 
 
-def _value(result: Result | None, metric: str) -> float | None:
-    if result is None or result.status != "ok":
-        return None
-    if metric in DERIVED:
-        _, over, under = DERIVED[metric]
-        top, bottom = result.value(over), result.value(under)
-        return top / bottom if top is not None and bottom else None
-    return result.value(metric)
+def _run_frame(runs: Sequence[StudyRun], metrics: Sequence[str]) -> pd.DataFrame:
+    """A row per run. reused_seconds: of fit_seconds, what was spent in an earlier run of the study."""
+    records = [run.entry.record if run.entry else None for run in runs]
+    columns = {
+        "scene": [run.planned.scene.name for run in runs],
+        "variant": [run.planned.variant.name for run in runs],
+        "seed": [run.planned.seed for run in runs],
+        "status": [run.status for run in runs],
+        "reason": [run.reason for run in runs],
+        **{name: pd.Series([run.value(name) for run in runs], dtype=float) for name in metrics},
+        "reused_seconds": [sum(record.reused.values()) if record and record.reused else None for record in records],
+        "runs_at_once": pd.array([run.entry.at_once if run.entry else None for run in runs], dtype="Int64"),
+        "digest": [run.planned.digest[:16] for run in runs],
+        "mixed": [str(run.result.mixed).lower() if run.result else "" for run in runs],
+    }
+    return pd.DataFrame(columns)
 
 
-def _scene_means(runs: Sequence[Run], metric: str, scenes: Sequence[str]) -> dict[int, float]:
-    """Seed -> mean over `scenes`, of the seeds that have the figure on all of them."""
-    values = {(run.planned.seed, run.planned.scene.name): run.values[metric] for run in runs}
-    means = {}
-    for seed in dict.fromkeys(run.planned.seed for run in runs):
-        known = [value for scene in scenes if (value := values.get((seed, scene))) is not None]
-        if known and len(known) == len(scenes):
-            means[seed] = fmean(known)
-    return means
+def _scene_means(runs: pd.DataFrame, scenes_of: Mapping[str, Sequence[str]]) -> pd.DataFrame:
+    """By variant and seed: each metric's mean over its scenes, NaN where the figure of one is missing."""
+    order = pd.MultiIndex.from_frame(runs[["variant", "seed"]].drop_duplicates())
+    means = {
+        metric: runs.pivot(index=["variant", "seed"], columns="scene", values=metric)
+        .reindex(columns=list(scenes))
+        .mean(axis=1, skipna=False)
+        for metric, scenes in scenes_of.items()
+    }
+    return pd.DataFrame(means, index=order)
 
 
-def _cell(means: Mapping[int, float], baseline: Mapping[int, float] | None) -> Cell:
-    """`baseline` is None for the baseline itself, which has no difference to itself."""
-    values = tuple(means.values())
-    differences = [value - baseline[seed] for seed, value in means.items() if baseline and seed in baseline]
-    return Cell(_mean(values), _spread(values), values, _mean(differences), _spread(differences))
+def _figures(means: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """By variant: mean and deviation over seeds, of the figures and of their differences to the baseline's."""
+    differences = means - means.loc[baseline].reindex(means.index.get_level_values("seed")).to_numpy()
+    differences.loc[baseline] = float("nan")
+    seeds, seed_differences = (frame.groupby("variant", sort=False) for frame in (means, differences))
+    parts = (seeds.mean(), seeds.std(), seed_differences.mean(), seed_differences.std())
+    figures = pd.concat([part.add_suffix(suffix) for part, suffix in zip(parts, SUFFIXES)], axis=1)
+    return figures[[f"{metric}{suffix}" for metric in means.columns for suffix in SUFFIXES]]
 
 
-def _mean(values: Sequence[float]) -> float | None:
-    return fmean(values) if values else None
+def _cell(metric: str, figures: pd.Series, means: pd.DataFrame) -> Cell:
+    mean, std, difference, difference_std = (_or_none(figures[f"{metric}{suffix}"]) for suffix in SUFFIXES)
+    return Cell(mean, std, tuple(means[metric].dropna().tolist()), difference, difference_std)
 
 
-def _spread(values: Sequence[float]) -> float | None:
-    return stdev(values) if len(values) > 1 else None
+def _or_none(value: float) -> float | None:
+    return None if pd.isna(value) else float(value)
 
 
-def _paper_figures(plan: Plan) -> dict[str, dict[str, float]]:
+def _paper_figures(spec: StudySpec) -> dict[str, dict[str, float]]:
     """Row -> metric -> what the paper reports, in the metric's unit."""
-    spec = plan.spec
     if spec.paper is None:
         return {}
     from splashbench.paper_figures import paper_rows
@@ -217,14 +240,12 @@ def _paper_figures(plan: Plan) -> dict[str, dict[str, float]]:
     names = {variant.name: variant.paper for variant in spec.variants if variant.paper}
     if spec.reference:
         names[spec.reference.method] = spec.reference.method
-    figures = {}
-    for name, method in names.items():
-        row = reported.get(method, {})
-        figures[name] = {
-            metric: float(value) * unit
+    return {
+        name: {
+            metric: float(value) * _PAPER_COLUMNS[metric][1]
             for metric in spec.metrics
             if metric in _PAPER_COLUMNS
-            for column, unit in [_PAPER_COLUMNS[metric]]
-            if (value := row.get(column)) is not None
+            if (value := reported.get(method, {}).get(_PAPER_COLUMNS[metric][0])) is not None
         }
-    return figures
+        for name, method in names.items()
+    }

@@ -13,11 +13,12 @@ from splashbench.cli.score import _summary
 from splashbench.harness.runner import run_method
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
-from splashbench.report.leaderboard import leaderboard_rows
-from splashbench.report.markdown import to_markdown
-from splashbench.report.results import Source
+from splashbench.report.results import ResultFile
+from splashbench.report.table import leaderboard_table
+from splashbench.report.table_markdown import to_markdown
 from splashbench.scene import Scene
-from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE, METRICS, filter_mark
+from splashbench.score.metrics import METRICS
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, filter_mark
 
 FIGURES = {"psnr": 20.0, "miou": 0.71, "spill": 0.123, "spill_rgb": 0.345, "sigma_d": 52.0, "fit_seconds": 60.0}
 MARKED = {"0.7100", "0.1230", "52.0"}
@@ -47,7 +48,7 @@ def test_what_rests_on_the_filter() -> None:
 
 
 def test_the_leaderboard_marks_them_by_scene_and_in_means(results: list[Any]) -> None:
-    text = to_markdown(leaderboard_rows([Source(f"{i}.json", result) for i, result in enumerate(results)]), [])
+    text = to_markdown(leaderboard_table([ResultFile(f"{i}.json", result) for i, result in enumerate(results)]), [])
     assert FILTER_NOTE in text
     lines = [line for line in text.splitlines() if line.startswith("| together")]
     assert len(lines) == 3  # two scenes and the mean
@@ -59,7 +60,7 @@ def test_the_leaderboard_marks_them_by_scene_and_in_means(results: list[Any]) ->
 
 
 def test_the_note_stands_only_where_a_mixed_method_does(results: list[Any]) -> None:
-    text = to_markdown(leaderboard_rows([Source("0.json", results[0])]), [])
+    text = to_markdown(leaderboard_table([ResultFile("0.json", results[0])]), [])
     assert FILTER_MARK not in text
 
 
@@ -96,7 +97,7 @@ def test_the_contact_sheet_marks_the_opacity(balls: Scene, tmp_path: Path, monke
 def test_the_chart_marks_miou_and_not_lpips(make_result: Any, results: list[Any], tmp_path: Path) -> None:
     def drawn(name: str, chosen: list[Any]) -> str:
         (tmp_path / name).mkdir()
-        sources = [Source(f"{i}.json", result) for i, result in enumerate(chosen)]
+        sources = [ResultFile(f"{i}.json", result) for i, result in enumerate(chosen)]
         return speed_accuracy_chart(sources, tmp_path / name)[1].read_text()
 
     with_lpips = [make_result("together", scene=scene, mixed=True, lpips=0.05, **FIGURES) for scene in ("bowl", "tank")]

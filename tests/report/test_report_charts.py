@@ -9,10 +9,10 @@ import pytest
 
 from splashbench.files import image_size
 from splashbench.report.charts import speed_accuracy_chart
-from splashbench.report.leaderboard import Row
-from splashbench.report.markdown import to_markdown
-from splashbench.report.results import Source, load_results
+from splashbench.report.results import ResultFile, load_results
 from splashbench.report.speed_accuracy import machines, pareto_front, reported_machine, summarize
+from splashbench.report.table import leaderboard_table
+from splashbench.report.table_markdown import to_markdown
 
 
 def test_pareto_front_keeps_what_nothing_beats_in_both() -> None:
@@ -50,23 +50,23 @@ def test_the_gain_over_background_is_charted_only_when_every_run_has_it(make_res
         make_result("alpha", 0, psnr=20.0, dpsnr_bg=2.0, fit_seconds=5.0),
         make_result("beta", 0, psnr=19.0, fit_seconds=5.0),
     ]
-    (machine,) = machines([Source(f"{i}.json", result) for i, result in enumerate(results)])
+    (machine,) = machines([ResultFile(f"{i}.json", result) for i, result in enumerate(results)])
     assert machine.quality_name() == "psnr"
 
 
 def test_without_lpips_weights_the_panel_shows_miou(make_result: Any) -> None:
     without = make_result("alpha", 0, psnr=20.0, miou=0.8, fit_seconds=5.0)
-    (machine,) = machines([Source("0.json", without)])
+    (machine,) = machines([ResultFile("0.json", without)])
     assert machine.perceptual_name() == "miou"
     weighed = make_result("beta", 0, psnr=20.0, miou=0.8, lpips=0.1, fit_seconds=5.0)
-    (machine,) = machines([Source("0.json", without), Source("1.json", weighed)])
+    (machine,) = machines([ResultFile("0.json", without), ResultFile("1.json", weighed)])
     assert machine.perceptual_name() == "lpips"
 
 
 def test_two_protocols_never_share_a_panel(make_result: Any) -> None:
     first = make_result("alpha", 0, psnr=20.0, fit_seconds=5.0)
     changed = first.model_copy(update={"protocol": first.protocol.model_copy(update={"opacity_threshold": 0.9})})
-    found = machines([Source("0.json", first), Source("1.json", changed)])
+    found = machines([ResultFile("0.json", first), ResultFile("1.json", changed)])
     assert [len(machine.entries[0].dots) for machine in found] == [1, 1]
     assert found[0].title.endswith("protocol v1")
 
@@ -77,22 +77,22 @@ def test_presets_and_settings_of_a_method_are_told_apart(make_result: Any) -> No
         make_result("alpha", 0, psnr=20.0, fit_seconds=5.0, preset="quick"),
         make_result("alpha", 0, psnr=20.0, fit_seconds=5.0, preset="quick", settings={"grid": 48}),
     ]
-    (machine,) = machines([Source(f"{i}.json", result) for i, result in enumerate(results)])
+    (machine,) = machines([ResultFile(f"{i}.json", result) for i, result in enumerate(results)])
     labels = [entry.label for entry in machine.entries]
     assert labels[0] == "alpha [best]"
     assert all(re.fullmatch(r"alpha \[quick\] [0-9a-f]{8}", label) for label in labels[1:])
 
 
 def test_a_run_without_a_fit_time_is_shown_as_such(make_result: Any) -> None:
-    (machine,) = machines([Source("a.json", make_result("alpha", psnr=20.0))])
+    (machine,) = machines([ResultFile("a.json", make_result("alpha", psnr=20.0))])
     assert dict(machine.failures) == {"alpha: fit time not measured": 1}
 
 
 def test_odd_names_from_strangers_files_are_drawn_as_they_are(make_result: Any, tmp_path: Path) -> None:
     odd = make_result("alpha", 0, "bowl", "$\\broken{", "why", cpu="$\\frac{ <b>")
-    _, svg = speed_accuracy_chart([Source("a.json", odd)], tmp_path)
+    _, svg = speed_accuracy_chart([ResultFile("a.json", odd)], tmp_path)
     assert "$\\broken{" in svg.read_text()
-    text = to_markdown([Row((odd,))], [Source("a.json", odd)])
+    text = to_markdown(leaderboard_table([ResultFile("a.json", odd)]), [ResultFile("a.json", odd)])
     assert "<b>" not in text
 
 
@@ -124,5 +124,5 @@ def test_charts_show_every_run_and_have_the_same_bytes_each_time(folder: Path, t
 @pytest.mark.parametrize("status", ["ok", "crashed"])
 def test_a_chart_of_one_run_or_of_failures_alone_can_be_drawn(make_result: Any, tmp_path: Path, status: str) -> None:
     values = {"psnr": 20.0, "fit_seconds": 5.0} if status == "ok" else {}
-    png, _ = speed_accuracy_chart([Source("a.json", make_result("alpha", 0, "bowl", status, **values))], tmp_path)
+    png, _ = speed_accuracy_chart([ResultFile("a.json", make_result("alpha", 0, "bowl", status, **values))], tmp_path)
     assert image_size(png)[1] > 300

@@ -8,13 +8,14 @@ from typing import Any
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.report.leaderboard import CSV_COLUMNS, Row, leaderboard_rows, to_csv, write_leaderboard
-from splashbench.report.markdown import to_markdown
-from splashbench.report.results import Source, load_results
+from splashbench.report.leaderboard import write_leaderboard
+from splashbench.report.results import ResultFile, load_results
+from splashbench.report.table import CSV_COLUMNS, leaderboard_table, to_csv
+from splashbench.report.table_markdown import to_markdown
 
 
 def _table(folder: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(to_csv(leaderboard_rows(load_results(folder))))))
+    return list(csv.DictReader(io.StringIO(to_csv(leaderboard_table(load_results(folder))))))
 
 
 def test_columns_begin_with_the_names_of_the_schema() -> None:
@@ -47,7 +48,7 @@ def test_failures_keep_their_rows_and_reasons(folder: Path) -> None:
     assert [(row["method"], row["status"], row["psnr"]) for row in failed] == [("gamma", "out_of_memory", "")]
     assert failed[0]["reason"] == "killed (signal 9) | of 8 GiB"
     sources = load_results(folder)
-    text = to_markdown(leaderboard_rows(sources), sources)
+    text = to_markdown(leaderboard_table(sources), sources)
     assert "| gamma | best | 0 | out_of_memory |" in text
     assert "- gamma (best, seed 0) on bowl: out_of_memory: killed (signal 9)" in text
 
@@ -60,7 +61,7 @@ def test_a_seed_that_fails_is_not_averaged_away(folder: Path, make_result: Any) 
 
 def test_controls_are_marked_and_never_best(folder: Path) -> None:
     sources = load_results(folder)
-    text = to_markdown(leaderboard_rows(sources), sources)
+    text = to_markdown(leaderboard_table(sources), sources)
     assert "| *oracle* |" in text
     assert "**100.00**" not in text
     assert "**19.90** ± 0.10" in text
@@ -70,7 +71,7 @@ def test_controls_are_marked_and_never_best(folder: Path) -> None:
 def test_means_over_scenes_leave_out_methods_that_failed_on_one(folder: Path, make_result: Any) -> None:
     def means() -> dict[str, str]:
         sources = load_results(folder)
-        text = to_markdown(leaderboard_rows(sources), sources)
+        text = to_markdown(leaderboard_table(sources), sources)
         section = text.partition("## Mean over 2 scenes")[2].partition("## Hardware")[0]
         lines = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
         return {line[0]: line[3] for line in lines}
@@ -81,14 +82,19 @@ def test_means_over_scenes_leave_out_methods_that_failed_on_one(folder: Path, ma
     assert means()["alpha"] == "–"
 
 
+def _write(folder: Path, out: Path) -> list[Path]:
+    sources = load_results(folder)
+    return write_leaderboard(leaderboard_table(sources), sources, out)
+
+
 def test_bytes_do_not_depend_on_where_or_in_which_order_results_lie(folder: Path, tmp_path: Path) -> None:
-    first = [path.read_bytes() for path in write_leaderboard(load_results(folder), tmp_path / "a")]
-    again = [path.read_bytes() for path in write_leaderboard(load_results(folder), tmp_path / "b")]
+    first = [path.read_bytes() for path in _write(folder, tmp_path / "a")]
+    again = [path.read_bytes() for path in _write(folder, tmp_path / "b")]
     assert first == again
     for i, path in enumerate(sorted(folder.glob("*.json"), reverse=True)):
         (tmp_path / "moved" / str(i)).mkdir(parents=True)
         (tmp_path / "moved" / str(i) / "result.json").write_bytes(path.read_bytes())
-    assert to_csv(leaderboard_rows(load_results(tmp_path / "moved"))).encode() == first[0]
+    assert to_csv(leaderboard_table(load_results(tmp_path / "moved"))).encode() == first[0]
 
 
 def test_runs_with_other_settings_hardware_or_protocol_are_never_averaged(make_result: Any) -> None:
@@ -98,9 +104,9 @@ def test_runs_with_other_settings_hardware_or_protocol_are_never_averaged(make_r
         make_result("alpha", 2, psnr=30.0, cpu="another processor"),
         make_result("alpha", 3, psnr=40.0, method_version="2"),
     ]
-    rows = leaderboard_rows([Source(f"{i}.json", result) for i, result in enumerate(results)])
-    assert [row.value("psnr") for row in rows] == [40.0, 30.0, 20.0, 10.0]
-    assert all(len(row.runs) == 1 for row in rows)
+    table = leaderboard_table([ResultFile(f"{i}.json", result) for i, result in enumerate(results)])
+    assert list(table["psnr"]) == [40.0, 30.0, 20.0, 10.0]
+    assert list(table["runs"]) == [1] * 4
 
 
 def test_the_better_informed_of_two_scores_of_one_submission_stands(tmp_path: Path, make_result: Any) -> None:
@@ -127,8 +133,8 @@ def test_a_submission_given_for_results_is_told(tmp_path: Path) -> None:
 
 def test_sources_and_claims_are_listed(make_result: Any) -> None:
     result = make_result("alpha", psnr=20.0, claimed={"psnr": 35.0})
-    row = Row((result,))
-    text = to_markdown([row], [Source("deep/alpha.json", result)])
+    source = ResultFile("deep/alpha.json", result)
+    text = to_markdown(leaderboard_table([source]), [source])
     assert "psnr: claimed 35, verified 20.00" in text
     assert f"| deep/alpha.json | `{result.digests.scene[:12]}` | `{result.digests.submission[:12]}` |" in text
 

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from splashbench.report.leaderboard import CSV_COLUMNS, leaderboard_rows, to_csv
-from splashbench.report.markdown import to_markdown
 from splashbench.report.results import load_results
+from splashbench.report.table import CSV_COLUMNS, leaderboard_table, to_csv
+from splashbench.report.table_markdown import to_markdown
 from splashbench.score.metrics import TRUTH_METRICS
 from splashbench.score.result import Result
 
@@ -20,7 +20,7 @@ def test_figures_against_the_truth_stand_at_the_end_and_in_a_table_of_their_own(
         make_result("alpha", seed, psnr=20.0, sdf_iou=0.6 + 0.1 * seed, velocity_epe_relative=0.5).save(tmp_path)
     make_result("beta", 0, psnr=19.0).save(tmp_path)
     sources = load_results(tmp_path)
-    rows = leaderboard_rows(sources)
+    rows = leaderboard_table(sources)
     assert CSV_COLUMNS[-16:] == (*TRUTH_METRICS, *(f"{name}_spread" for name in TRUTH_METRICS))
     alpha, beta = csv.DictReader(io.StringIO(to_csv(rows)))
     assert (alpha["sdf_iou"], alpha["sdf_iou_spread"], beta["sdf_iou"]) == ("0.6500", "0.1000", "")
@@ -44,7 +44,7 @@ def test_results_from_before_there_was_a_truth_are_read_and_stand_in_the_same_ta
     assert old.value("sdf_iou") is None
     assert old.digests.truth is None
     sources = load_results(tmp_path)
-    text = to_markdown(leaderboard_rows(sources), sources)
+    text = to_markdown(leaderboard_table(sources), sources)
     assert text.count("## bowl (protocol v1") == 1
     assert "Against the true particles" not in text
     assert "sdf_iou" not in text

@@ -14,7 +14,7 @@ from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Scene
 from splashbench.scene.checking import check_scene, describe_scene
 from splashbench.study.scenes import changed_scene
-from splashbench.study.spec import Variant
+from splashbench.study.spec import StudyVariant
 
 RADIUS, STEP = 0.5, 0.02
 
@@ -222,7 +222,7 @@ def test_a_methods_copy_has_the_training_views_alone(watersphere: Path, tmp_path
 def test_a_study_takes_such_a_scene_with_fewer_views_and_worse_masks(watersphere: Path, tmp_path: Path) -> None:
     scene = Scene.open(watersphere)
     damage = {"kind": "empty_masks", "share": 0.5}
-    variant = Variant.model_validate({"name": "worse", "train_views": 3, "perturbation": [damage]})
+    variant = StudyVariant.model_validate({"name": "worse", "train_views": 3, "perturbation": [damage]})
     changed = changed_scene(scene, variant, 0, tmp_path)
     assert len(changed.train) == 3
     assert changed.test == ("view_5",)

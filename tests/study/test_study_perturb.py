@@ -10,10 +10,10 @@ from splashbench.scene import Scene
 from splashbench.scene.checking import check_scene
 from splashbench.study.perturbation import EmptyMasks, MissingParts, empty_masks, missing_parts, without_part
 from splashbench.study.scenes import changed_scene, changes
-from splashbench.study.spec import Variant
+from splashbench.study.spec import StudyVariant
 from splashbench.study.view_subsets import azimuths, nested_views
 
-RAW = Variant(
+RAW = StudyVariant(
     name="raw",
     perturbation=(MissingParts(kind="missing_parts", target_iou=0.845), EmptyMasks(kind="empty_masks", share=0.086)),
 )
@@ -90,20 +90,20 @@ def test_fewer_views_are_nested_and_bracket_the_test_views(balls: Scene, tmp_pat
     angle = azimuths(balls)
     for name in balls.test:
         assert min(angle[view] for view in three) < angle[name] < max(angle[view] for view in three)
-    copy = changed_scene(balls, Variant(name="views_3", train_views=3), 0, tmp_path)
+    copy = changed_scene(balls, StudyVariant(name="views_3", train_views=3), 0, tmp_path)
     assert (copy.train, copy.test) == (three, balls.test)
     assert check_scene(copy.directory) == []
     np.testing.assert_array_equal(copy.cameras[three[1]].w2c, balls.cameras[three[1]].w2c)
     assert (copy.image("6", 3) == balls.image("6", 3)).all()
     assert {path.name for path in (copy.directory / "ims").iterdir()} == {*three, *balls.test}
-    assert changed_scene(balls, Variant(name="views_5", train_views=5), 0, tmp_path) is balls
+    assert changed_scene(balls, StudyVariant(name="views_5", train_views=5), 0, tmp_path) is balls
 
 
 def test_a_scene_without_scene_json_keeps_its_name(balls_copy: Path, tmp_path: Path) -> None:
     (balls_copy / "scene.json").unlink()
     balls_copy.rename(tmp_path / "bowl_003")  # one of Table S1, whose times follow from the name
     scene = Scene.open(tmp_path / "bowl_003")
-    copy = changed_scene(scene, Variant(name="v", train_views=4), 0, tmp_path / "cache")
+    copy = changed_scene(scene, StudyVariant(name="v", train_views=4), 0, tmp_path / "cache")
     assert (copy.name, copy.is_released, copy.times_source) == ("bowl_003", True, "manifest")
 
 
@@ -114,7 +114,7 @@ def test_views_that_cannot_be_are_told(balls: Scene) -> None:
         # Test views 6 and 7 stand between 1 and 2 and between 3 and 4: without camera 1 nothing is left of 6.
         nested_views(_Without(balls, "4", "5"), 2)
     with pytest.raises(SplashbenchError, match="no training view '9'; it has 1, 2, 3, 4, 5"):
-        changes(balls, Variant(name="v", train_views=("1", "9")), 0)
+        changes(balls, StudyVariant(name="v", train_views=("1", "9")), 0)
 
 
 class _Without:

@@ -11,14 +11,14 @@ import pytest
 
 from splashbench.files import read_json, write_model
 from splashbench.score import METRICS, PROTOCOL_V1, Result
-from splashbench.score.metrics import FILTER_MARK, FILTER_NOTE
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE
 from splashbench.score.result import Digests, metric_value
-from splashbench.study.job import Entry, Store
-from splashbench.study.markdown import to_markdown
-from splashbench.study.plan import Plan, Planned, make_plan
+from splashbench.study.job import RunEntry, Store
+from splashbench.study.plan import Plan, PlannedRun, make_plan
 from splashbench.study.report import runs_csv, table_csv, write_report
 from splashbench.study.spec import StudySpec
 from splashbench.study.table import Table, make_table
+from splashbench.study.table_markdown import to_markdown
 from splashbench.submission import Record
 from splashbench.synth.balls import write_balls_scene
 
@@ -71,7 +71,7 @@ def _made(plan: Plan, directory: Path, mixed: str = "") -> Store:
     return store
 
 
-def _put(store: Store, run: Planned, psnr: float | None, mixed: bool) -> None:
+def _put(store: Store, run: PlannedRun, psnr: float | None, mixed: bool) -> None:
     values = {"psnr": psnr, "sigma_d": 30.0, "mu_d": 120.0, "dynamic_bytes": 2_500_000.0, "fit_seconds": 60.0}
     if run.scene.name == "b":
         values["delta_e"] = 0.3  # scene a lacks what it needs
@@ -91,7 +91,7 @@ def _put(store: Store, run: Planned, psnr: float | None, mixed: bool) -> None:
         hardware={"cpu": "test processor", "cores": 2},
         mixed=mixed,
     )
-    entry = Entry(
+    entry = RunEntry(
         digest=run.digest,
         title=run.digest[:8],
         status=result.status,
@@ -124,7 +124,7 @@ def test_a_seed_that_lacks_a_scene_has_no_mean(table: Table) -> None:
     assert cell.seeds == (25.0, 27.0)
     assert (cell.difference, cell.difference_std) == (0.0, 0.0)
     assert [run.status for run in row.failed] == ["crashed"]
-    assert not row.whole
+    assert not row.complete
 
 
 def test_a_metric_is_averaged_over_the_scenes_that_can_have_it(table: Table) -> None:
