@@ -6,17 +6,16 @@ everything. The seconds that the part took when it was fitted stay with it, so t
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, Field
 
 from splashbench.files import atomic_directory, read_model, sha256_file, write_model
@@ -71,7 +70,8 @@ def reuse(
     whole = {"splashbench": __version__, "scene": scene_digest, **key}
     digest = hashlib.sha256(json.dumps([name, whole], sort_keys=True).encode()).hexdigest()[:16]
     place = Path(cache, f"{name}-{digest}")
-    with alone(place.with_suffix(".lock")):
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(place.with_suffix(".lock")):
         if (place / _FACTS).is_file():
             value, facts = load(place), read_model(place / _FACTS, Facts)
             return Part(value, facts.seconds, time.perf_counter() - start)
@@ -94,12 +94,3 @@ def training_digest(scene: TrainingScene) -> str:
             entry = [path.relative_to(scene.directory).as_posix(), sha256_file(path)]
             digest.update(json.dumps(entry).encode())
     return digest.hexdigest()
-
-
-@contextmanager
-def alone(lock: Path) -> Iterator[None]:
-    """Hold the file `lock` meanwhile, waiting for it; the kernel lets go of it for a process that is killed."""
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with lock.open("wb") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        yield

@@ -8,7 +8,6 @@ leaves files fills a folder whose result is written last: without it the folder 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import importlib.metadata
 import json
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
+from filelock import FileLock, Timeout
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from splashbench.errors import SplashbenchError
@@ -161,18 +161,16 @@ def open_stages(folder: Path, again_from: Stage | None = None) -> Iterator[Stage
             raise SplashbenchError(f"{folder} holds something else; name another folder with --work")
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _MARK_NAME).write_text(_MARK, encoding="utf-8")
-        lock = (folder / _LOCK_NAME).open("w")
+        lock = FileLock(folder / _LOCK_NAME).acquire(blocking=False)
+    except Timeout:
+        raise SplashbenchError(
+            f"{folder} is in use by another `splashbench prepare`; wait for it, or name another folder with --work"
+        ) from None
     except OSError as error:
         raise SplashbenchError(
             f"{folder} cannot be written ({error.strerror}); name another folder with --work"
         ) from None
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise SplashbenchError(
-                f"{folder} is in use by another `splashbench prepare`; wait for it, or name another folder with --work"
-            ) from None
         store = StageStore(folder)
         if again_from is not None:
             store.forget(again_from)

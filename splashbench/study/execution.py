@@ -6,7 +6,6 @@ Killed at any time, a study loses the runs in progress. A run that fails is an e
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import shutil
 import subprocess
@@ -17,6 +16,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import require_folder_place, write_model, write_text
@@ -228,11 +229,11 @@ def _claimed(store: Store) -> Iterator[None]:
         raise SplashbenchError(f"{out} holds files that are no study's; give a new or an empty folder")
     if not (out / _MARK).is_file():
         write_text(out / _MARK, "Made by `splashbench study`, which may replace everything here.\n")
-    with (out / _MARK).open("r+b") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SplashbenchError(f"another study is running in {out}; wait for it, or give another place") from None
+    try:
+        lock = FileLock(out / ".lock").acquire(blocking=False)
+    except Timeout:
+        raise SplashbenchError(f"another study is running in {out}; wait for it, or give another place") from None
+    with lock:
         for folder in (store.submissions, *store.cache.glob("*"), *store.cache.glob("scenes/*")):
             for leftover in folder.glob(".tmp-*"):
                 shutil.rmtree(leftover, ignore_errors=True)

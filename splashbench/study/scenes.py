@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
-from splashbench.harness.reuse import alone
 from splashbench.scene import Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
 from splashbench.scene.layout import plain_name
@@ -63,7 +63,8 @@ def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -
     text = json.dumps([scene.digest, said], sort_keys=True)
     # The folder keeps its name: without scene.json it decides what a scene is (Table S1).
     place = cache / hashlib.sha256(text.encode()).hexdigest()[:16] / scene.directory.resolve().name
-    with alone(place.parent.with_suffix(".lock")):
+    place.parent.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(place.parent.with_suffix(".lock")):
         if not place.exists():
             with atomic_directory(place) as staging:
                 _copy(scene, said.get("train_views", list(scene.train)), staging)
