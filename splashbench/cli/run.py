@@ -10,6 +10,7 @@ from splashbench.cli import run_external as external
 from splashbench.cli.output import add_json, emit, say
 
 if TYPE_CHECKING:
+    from splashbench.scene import Scene, SignedDistance
     from splashbench.submission import Submission
 
 _EPILOG = """\
@@ -122,4 +123,11 @@ def _run_method(arguments: argparse.Namespace) -> Submission:
         withheld=arguments.withhold,
         keep_model=not arguments.no_model,
         replace=arguments.replace,
+        oracle_geometry=_oracle_geometry,
     )
+
+
+def _oracle_geometry(scene: Scene) -> SignedDistance | None:
+    from splashbench.score.truth.comparison import oracle_geometry
+
+    return oracle_geometry(scene)

@@ -106,6 +106,7 @@ def run(arguments: argparse.Namespace) -> Submission:
     from splashbench.cli.scene import POINTS
     from splashbench.harness.external.runner import ExternalCode, run_external
     from splashbench.harness.runner import TIMING_FRAMES
+    from splashbench.observe import initial_points
     from splashbench.scene import Scene
     from splashbench.scene.exporting import remarks
 
@@ -131,6 +132,7 @@ def run(arguments: argparse.Namespace) -> Submission:
         code,
         arguments.scene,
         arguments.out,
+        initial_points=initial_points,
         preset=arguments.preset,
         seed=arguments.seed,
         device=arguments.device,

@@ -7,11 +7,11 @@ truth; else the particle metrics are null.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.harness import hardware
 from splashbench.progress import track
@@ -20,8 +20,18 @@ from splashbench.submission import IDENTITY, Identity, Record, Submission, seal,
 from splashbench.version import __version__
 
 
-def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
-    """Write the oracle's submission for `scene` into `out`."""
+def write_oracle(
+    scene: Scene,
+    out: Path,
+    *,
+    geometry: Callable[[Scene], SignedDistance | None] | None = None,
+    replace: bool = False,
+) -> Submission:
+    """Write the oracle's submission for `scene` into `out`.
+
+    geometry: gives the true liquid of a scene with true particles (score.truth.comparison.oracle_geometry); without it
+    no signed distance is handed in.
+    """
     with atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene.directory]) as staging:
         for t in track(range(scene.n_frames), "oracle"):
             for name in scene.test:
@@ -30,9 +40,9 @@ def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
         particles = scene.truth_particles()
         if particles is not None:
             particles.save(staging / "particles.npz")
-            geometry = _true_geometry(scene)
-            if geometry is not None:
-                geometry.save(staging / "geometry.npz")
+            signed_distance = geometry(scene) if geometry is not None else None
+            if signed_distance is not None:
+                signed_distance.save(staging / "geometry.npz")
         identity = Identity(
             method="oracle",
             preset="truth",
@@ -42,17 +52,6 @@ def write_oracle(scene: Scene, out: Path, replace: bool = False) -> Submission:
             splashbench_version=__version__,
             hardware=hardware.describe(),
         )
-        carriers = float(particles.active.sum(axis=1).mean()) if particles is not None else None
-        seal(staging, identity, Record(particles_per_frame=carriers))
+        count = float(particles.active.sum(axis=1).mean()) if particles is not None else None
+        seal(staging, identity, Record(particles_per_frame=count))
     return Submission.open(out)
-
-
-def _true_geometry(scene: Scene) -> SignedDistance | None:
-    """The true liquid as the protocol defines it; None where the training masks give no hull, hence no grid."""
-    from splashbench.score.protocol import shared_fields
-    from splashbench.score.truth.comparison import true_geometry
-
-    try:
-        return true_geometry(scene, shared_fields(scene)())
-    except SplashbenchError:
-        return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.messages import DISK_FULL_EXIT, Outcome, Request
 from splashbench.harness.process import Watched, run_watched
 from splashbench.harness.training_copy import make_training_view
-from splashbench.scene import Particles, Scene
+from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
 from splashbench.submission.withheld import Withheld, kept_timesteps
 from splashbench.version import __version__
@@ -47,6 +47,7 @@ def run_method(
     exr: bool = False,
     cache: Path | None = None,
     withheld: Withheld | None = None,
+    oracle_geometry: Callable[[Scene], SignedDistance | None] | None = None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
 
@@ -59,6 +60,7 @@ def run_method(
         exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
         cache: a folder for what the runs of one study share (adapter/reuse.py); the record says what came from there.
         withheld: timesteps that the method does not see; they are rendered and scored (submission/withheld.py).
+        oracle_geometry: for the control `oracle` alone, see `write_oracle`.
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
     """
@@ -74,7 +76,7 @@ def run_method(
             raise SplashbenchError("the oracle is the truth itself, without presets or settings; leave them out")
         from splashbench.harness.oracle import write_oracle
 
-        return write_oracle(scene, out, replace=replace)
+        return write_oracle(scene, out, geometry=oracle_geometry, replace=replace)
     method = load_method(name)
     if device not in method.devices:
         known = ", ".join(method.devices)

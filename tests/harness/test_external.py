@@ -1,5 +1,6 @@
 """A stranger's code, run by commands: whatever it does there is a whole submission with a status, or none at all."""
 
+import functools
 import json
 import os
 import runpy
@@ -18,8 +19,9 @@ import pytest
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json
+from splashbench.harness.external import runner
 from splashbench.harness.external.collection import collect
-from splashbench.harness.external.runner import ExternalCode, run_external
+from splashbench.harness.external.runner import ExternalCode
 from splashbench.harness.messages import Failure
 from splashbench.observe import initial_points
 from splashbench.scene import Scene
@@ -32,6 +34,7 @@ PYTHON = shlex.quote(sys.executable)
 POINTS = 20
 #: Seconds that a code hangs for; time enough to have begun, on a machine with much else to do.
 LIMIT = 6.0
+run_external = functools.partial(runner.run_external, initial_points=initial_points)
 
 
 def _fit(behaviour: str, *rest: object) -> str:

@@ -137,12 +137,13 @@ def test_wrong_names_and_settings_are_told_before_anything_runs(balls_directory:
 
 
 def test_the_oracle_is_the_truth(balls_directory: Path, balls: Scene, tmp_path: Path) -> None:
-    submission = run_method("oracle", balls_directory, tmp_path / "oracle")
+    submission = run_method("oracle", balls_directory, tmp_path / "oracle", oracle_geometry=lambda scene: None)
     assert submission.identity.control
     for camera in balls.test:
         assert (submission.rendering(camera, 4) == balls.image(camera, 4)).all()
         assert (submission.alpha(camera, 4) == balls.mask(camera, 4)).all()
     assert submission.particles() is not None
+    assert submission.geometry() is None
     assert check_submission(tmp_path / "oracle", balls) == []
 
 

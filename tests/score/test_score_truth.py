@@ -12,13 +12,13 @@ from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.score import Result, score_submission, shared_fields
 from splashbench.score.metrics import TRUTH_METRICS
-from splashbench.score.truth.comparison import NO_TRUTH, true_geometry, true_spacing
+from splashbench.score.truth.comparison import NO_TRUTH, oracle_geometry, true_geometry, true_spacing
 from splashbench.submission import Submission, check_submission, seal
 
 
 @pytest.fixture(scope="module")
 def sealed(balls: Scene, tmp_path_factory: pytest.TempPathFactory) -> Submission:
-    return write_oracle(balls, tmp_path_factory.mktemp("truth") / "oracle")
+    return write_oracle(balls, tmp_path_factory.mktemp("truth") / "oracle", geometry=oracle_geometry)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,8 @@ def test_a_scene_without_true_particles_has_no_score_against_them(balls_copy: Pa
     assert all(result.metrics[name].reason == NO_TRUTH for name in TRUTH_METRICS)
     assert result.digests.truth is None
     assert result.value("uniformity") is not None
-    assert not (write_oracle(scene, balls_copy.parent / "oracle").directory / "geometry.npz").exists()
+    oracle = write_oracle(scene, balls_copy.parent / "oracle", geometry=oracle_geometry)
+    assert not (oracle.directory / "geometry.npz").exists()
 
 
 def test_every_null_against_the_truth_says_why(balls: Scene, truth: Particles, fake: Any, quiet: Any) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from splashbench.harness.process import Watched, watch
 from splashbench.harness.runner import particles_per_frame, run_phase
 from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Scene
-from splashbench.scene.exporting import TEST_VIEWS, export_scene
+from splashbench.scene.exporting import TEST_VIEWS, InitialPoints, export_scene
 from splashbench.submission import Record, Status
 
 #: Deformable-3DGS looks at the parent's name to tell which kind of nerfies dataset it is given.
@@ -41,7 +42,7 @@ class ExternalCode:
         importer: an importer's name, or None.
         shell: whether the commands are for /bin/sh, with pipes and variables, rather than a program and arguments.
         directory: where the commands run.
-        blank_test_images, masks, points: of the export; see `export_scene`, and `initial_points` for the points.
+        blank_test_images, masks, points: of the export; see `export_scene`, and of `run_external` for the points.
     """
 
     name: str
@@ -96,10 +97,8 @@ class ExternalRun:
         """Where the code leaves its renders."""
         return self.scratch / "into"
 
-    def export(self) -> None:
+    def export(self, initial_points: Callable[[Scene, int], InitialPoints]) -> None:
         """Export the scene without test images, and make the folders that the commands are given."""
-        from splashbench.observe import initial_points
-
         for folder in (self.output, self.into):
             folder.mkdir(exist_ok=True)  # a trained model is there already
         facts = export_scene(

@@ -8,7 +8,7 @@ then the test views come from a render command, from the fit command itself, or 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from splashbench.harness.external.phases import ExternalCode, ExternalRun
 from splashbench.harness.messages import Failure
 from splashbench.harness.runner import TIMING_FRAMES, drop_unwanted, require_unchanged, without_nulls
 from splashbench.scene import Scene
+from splashbench.scene.exporting import InitialPoints
 from splashbench.submission import IDENTITY, Identity, Submission, identity_text, seal
 from splashbench.version import __version__
 
@@ -35,6 +36,7 @@ def run_external(
     scene_directory: Path,
     out: Path,
     *,
+    initial_points: Callable[[Scene, int], InitialPoints],
     preset: str | None = None,
     seed: int = 0,
     device: str = "cpu",
@@ -48,6 +50,8 @@ def run_external(
     """Run `code` on the scene and write the submission `out`.
 
     Args:
+        initial_points: gives the points that the export has for the code to start from, of the scene and with at most
+            `code.points` of the liquid in each timestep (observe.initial_points).
         preset: how the submission calls the settings that the commands hold.
         seed, device: what the placeholders of these names stand for.
         timeout_seconds: limit for the fit, and again for the rendering.
@@ -69,7 +73,7 @@ def run_external(
     ):
         run = ExternalRun(code, scene, scratch, staging, seed, device, timeout_seconds)
         try:
-            run.export()
+            run.export(initial_points)
             run.fit()
             if code.importer:
                 run.import_model(timing_frames, exr)

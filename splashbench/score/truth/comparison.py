@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.observe import signed_distance_fields
 from splashbench.observe.grid import Grid
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.score.image.views import Track
@@ -21,7 +22,7 @@ from splashbench.score.metrics import TRUTH_METRICS
 from splashbench.score.particles.surface import particle_distance, spacing
 from splashbench.score.particles.uniformity import DistanceFields
 from splashbench.score.result import MetricValue, metric_value
-from splashbench.score.settings import Protocol
+from splashbench.score.settings import PROTOCOL_V1, Protocol
 from splashbench.score.truth.level_set import Field, chamfer, filled, overlap, resampled, surface_points
 from splashbench.score.truth.motion import FrameMotion, frame_motion, free_flight, known_velocities, relative
 
@@ -66,6 +67,17 @@ def true_geometry(scene: Scene, fields: DistanceFields) -> SignedDistance | None
         for t in range(scene.n_frames)
     ]
     return SignedDistance(np.concatenate(frames), grid.origin, grid.voxel)
+
+
+def oracle_geometry(scene: Scene, protocol: Protocol = PROTOCOL_V1) -> SignedDistance | None:
+    """The true liquid as the control `oracle` hands it in, on the grid of `protocol`.
+
+    None where the scene has no truth, or its training masks give no hull, hence no grid.
+    """
+    try:
+        return true_geometry(scene, signed_distance_fields(scene.training(), cells_longest_axis=protocol.grid_cells))
+    except SplashbenchError:
+        return None
 
 
 def score_ground_truth(
