@@ -7,10 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench import Camera, Fitted, Method, MethodConfig, Particles, Render, Run, TrainingScene
 from splashbench.observe import signed_distance_fields
 from splashbench.render import rasterize_arrays
-from splashbench.scene import Camera, Particles, TrainingScene
 
 
 class Settings(MethodConfig):
