@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from splashbench.synth.balls import ARC_ORDER
+from splashbench.synth.imaging.geometry import ARC_ORDER
 
 OUT = Path(__file__).parents[1] / "images"
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#666666"
