@@ -38,8 +38,8 @@ from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cl
 from splashbench.gaussians.splats import unit_quaternion_matrices
 from splashbench.harness.external.importers import Importer
 from splashbench.scene import Camera, TrainingScene
-from splashbench.scene.exporting.nerfies import MICROSECONDS
-from splashbench.scene.exporting.records import FACTS, Facts
+from splashbench.scene.export.nerfies import MICROSECONDS
+from splashbench.scene.export.records import FACTS, ExportFacts
 
 from .deformation import Deformation
 from .model import ROWS, DeformableModel
@@ -168,4 +168,4 @@ def _clock(export: Path) -> tuple[float, float]:
         raise SplashbenchError(
             f"{path}: all photographs are of one time, by which the code divides; export a recording"
         )
-    return read_model(export / FACTS, Facts).time_origin_seconds, last / MICROSECONDS
+    return read_model(export / FACTS, ExportFacts).time_origin_seconds, last / MICROSECONDS

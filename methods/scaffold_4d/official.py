@@ -38,7 +38,7 @@ from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cl
 from splashbench.harness.external.importers import Importer
 from splashbench.render.constants import BLUR_VARIANCE, JACOBIAN_MARGIN
 from splashbench.scene import Camera, TrainingScene
-from splashbench.scene.exporting.records import FACTS, Facts
+from splashbench.scene.export.records import FACTS, ExportFacts
 
 from ..scaffold_gs.model import FEATURES
 from .model import MAX_CHILDREN, ROWS, AnchorSplats, SpacetimeAnchors, State, Variant, stored_children
@@ -144,7 +144,7 @@ class OfficialScaffold4D(Importer):
             slots = {f"{i}.{kind}": getattr(head[i], kind) for i in (0, 2) for kind in ("weight", "bias")}
             weights = path.with_name(f"{name}.pt")
             fill(slots, read_weights(weights), weights)
-        facts, ratio = read_model(export / FACTS, Facts), arguments.number("frame_ratio", 1.0)
+        facts, ratio = read_model(export / FACTS, ExportFacts), arguments.number("frame_ratio", 1.0)
         unit = (facts.time_span_seconds or 1.0) / (ratio if ratio > 0 else 1.0)
         model.clock.copy_(torch.tensor([facts.time_origin_seconds, unit], dtype=torch.float64))
         if arguments.flag("white_background"):

@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> Submission:
     from splashbench.harness.runner import TIMING_FRAMES
     from splashbench.observe import initial_points
     from splashbench.scene import Scene
-    from splashbench.scene.exporting import remarks
+    from splashbench.scene.export import remarks
 
     # The run puts the export into such a folder.
     for note in remarks(Scene.open(arguments.scene), arguments.format, Path("NeRF", "scene")):

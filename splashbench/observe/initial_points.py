@@ -14,7 +14,7 @@ from splashbench.observe.signed_distance import signed_distance_frames
 from splashbench.observe.silhouettes import Silhouettes
 from splashbench.progress import track
 from splashbench.scene import Scene, TrainingScene
-from splashbench.scene.exporting import InitialPoints
+from splashbench.scene.export import InitialPoints
 
 CELLS = 96
 #: Half the thickness, in voxels, of the layer of nodes that stands for a surface; thin streams are in it too.

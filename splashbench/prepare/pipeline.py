@@ -49,7 +49,7 @@ from splashbench.progress import track
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, read_mesh
 from splashbench.scene.layout import SceneMeta
-from splashbench.scene.writing import write_scene
+from splashbench.scene.writer import write_scene
 
 SHEET_COLUMNS = 6  # timesteps on the report's contact sheet
 OVERLAY_WIDTH = 480  # pixels of a frame with the container drawn on it

@@ -6,7 +6,7 @@ from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.layout import SceneMeta
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import Scene, TrainingScene
-from splashbench.scene.writing import write_scene
+from splashbench.scene.writer import write_scene
 
 __all__ = [
     "Camera",

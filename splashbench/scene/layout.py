@@ -57,10 +57,10 @@ class SplitFile:
         for row in meta.fn:
             for name in row:
                 if not _IMAGE_PATH.fullmatch(name) or ".." in name:
-                    raise SplashbenchError(f"{path}: fn names {name!r}, not CAMERA/FRAME.jpg; mend the entry")
+                    raise SplashbenchError(f"{path}: fn names {name!r}, not CAMERA/FRAME.jpg; fix the entry")
         self.names = tuple(name.split("/")[0] for name in meta.fn[0])
         if len(set(self.names)) != n_cameras:
-            raise SplashbenchError(f"{path}: fn lists a camera twice in one frame; mend the entry")
+            raise SplashbenchError(f"{path}: fn lists a camera twice in one frame; fix the entry")
         self.paths: dict[str, list[str]] = {name: [] for name in self.names}
         for t, row in enumerate(meta.fn):
             for c, name in enumerate(row):
@@ -70,7 +70,7 @@ class SplitFile:
         for names in self.paths.values():
             if len(set(names)) != n_frames:
                 twice = next(name for name in names if names.count(name) > 1)
-                raise SplashbenchError(f"{path}: fn names {twice} in two frames; mend the entry")
+                raise SplashbenchError(f"{path}: fn names {twice} in two frames; fix the entry")
         self.K, self.w2c, self.size, self.n_frames = intrinsics, w2c, (meta.w, meta.h), n_frames
 
 

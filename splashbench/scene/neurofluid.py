@@ -19,8 +19,15 @@ from splashbench.files import MAX_NPZ_BYTES, image_size, read_npz, read_rgba
 from splashbench.progress import track
 from splashbench.scene.layout import LARGEST, SceneMeta, plain_name
 from splashbench.scene.particles import Particles
-from splashbench.scene.source import META_FILE, RELEASED_FILES, Source
-from splashbench.scene.transforms import Frame, Transforms, intrinsics, read_transforms, shared_frames, world_to_camera
+from splashbench.scene.source import META_FILE, RELEASED_FILES, SceneSource
+from splashbench.scene.transforms import (
+    Transforms,
+    TransformsFrame,
+    intrinsics,
+    read_transforms,
+    shared_frames,
+    world_to_camera,
+)
 
 #: The simulation was written out 50 times a second, the interval of NeuroFluid's own transition model as well.
 STEP_SECONDS = 1 / 50
@@ -66,7 +73,9 @@ class ViewSplit:
     sizes: dict[str, tuple[int, int]]
 
     @classmethod
-    def of(cls, directory: Path, split: str, views: dict[str, Transforms], frames: dict[str, list[Frame]]) -> ViewSplit:
+    def of(
+        cls, directory: Path, split: str, views: dict[str, Transforms], frames: dict[str, list[TransformsFrame]]
+    ) -> ViewSplit:
         """The `views` of `split` ("train" or "test"), with the frames chosen for each."""
         paths = {name: [f"{name}/{frame.file_path}.png" for frame in frames[name]] for name in views}
         sizes = {name: image_size(directory / paths[name][0]) for name in views}
@@ -82,12 +91,12 @@ class ViewSplit:
         )
 
 
-def _particle_paths(folder: str, frames: list[Frame]) -> list[str]:
+def _particle_paths(folder: str, frames: list[TransformsFrame]) -> list[str]:
     paths = [f"{folder}/{frame.particle_path}" for frame in frames if frame.particle_path is not None]
     return paths if len(paths) == len(frames) else []
 
 
-class NeuroFluidSource(Source):
+class NeuroFluidSource(SceneSource):
     """A scene of NeuroFluid: the last view is the test view, every other one trains.
 
     Its timesteps are the frames that all views have.

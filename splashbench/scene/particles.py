@@ -1,4 +1,4 @@
-"""Particles over time: a method's carriers, or the ground truth of a made-up scene."""
+"""Particles over time: a method's carriers, or the ground truth of a synthetic scene."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, mesh_path, read_mesh
 from splashbench.scene.neurofluid import NeuroFluidSource, is_neurofluid
 from splashbench.scene.particles import Particles
-from splashbench.scene.source import ReleasedSource, Source
+from splashbench.scene.source import ReleasedSource, SceneSource
 
 Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.bool_])
 
@@ -45,7 +45,7 @@ class Scene:
         is_released: whether this is one of the 20 released scenes, in the release's units.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: SceneSource) -> None:
         self._source = source
         self.directory, self.layout = source.directory, source.layout
         self.name, self.meta = source.name, source.meta
@@ -60,7 +60,7 @@ class Scene:
                 try:
                     self.cameras[name] = Camera(name, width, height, split.K[c], split.w2c[c])
                 except ValueError as error:
-                    raise SplashbenchError(f"{self.directory}: {error}; mend the calibration") from None
+                    raise SplashbenchError(f"{self.directory}: {error}; fix the calibration") from None
         self._set_times()
         meta = self.meta
         self.gravity = np.array(meta.gravity) if meta and meta.gravity else None
@@ -101,7 +101,7 @@ class Scene:
             if unknown:
                 raise SplashbenchError(
                     f"{self.directory / 'scene.json'}: {key} names camera {unknown[0]}, which the scene does not have; "
-                    "mend the entry"
+                    "fix the entry"
                 )
         self.camera_times = {
             name: self._checked_times(f"camera_times of {name}", own[name]) if name in own else self.times
@@ -170,11 +170,11 @@ class Scene:
 
     @property
     def has_truth(self) -> bool:
-        """Whether it is a made-up scene whose true particles are known."""
+        """Whether it is a synthetic scene whose true particles are known."""
         return bool(self._source.truth_files())
 
     def truth_particles(self) -> Particles | None:
-        """The true particles of a made-up scene, on the scene's timesteps, or None."""
+        """The true particles of a synthetic scene, on the scene's timesteps, or None."""
         return self._source.truth_particles() if self.has_truth else None
 
     @property

@@ -33,7 +33,7 @@ class Split(Protocol):
     n_frames: int
 
 
-class Source(ABC):
+class SceneSource(ABC):
     """The files of one scene, its calibration read and checked; both splits cover the same timesteps.
 
     Attributes:
@@ -97,7 +97,7 @@ class Source(ABC):
         return read_model(path, SceneMeta) if path.exists() or path.is_symlink() else None
 
 
-class ReleasedSource(Source):
+class ReleasedSource(SceneSource):
     """The layout of the released SplashSplat dataset, with or without scene.json (docs/scene_format.md)."""
 
     layout = "released"

@@ -25,7 +25,7 @@ _NUMBER = re.compile(r"(\d{1,9})(?:\.npz|\.png)?$", re.ASCII)
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
-class Frame(BaseModel):
+class TransformsFrame(BaseModel):
     """One frame: `file_path` is the image without its ending .png, `particle_path` the state of the simulation."""
 
     model_config = ConfigDict(extra="ignore")
@@ -46,7 +46,7 @@ class Transforms(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
     camera_angle_x: float = Field(gt=0, lt=np.pi)
-    frames: list[Frame] = Field(min_length=1)
+    frames: list[TransformsFrame] = Field(min_length=1)
 
 
 def read_transforms(path: Path) -> Transforms:
@@ -56,7 +56,7 @@ def read_transforms(path: Path) -> Transforms:
     return read_model(path, Transforms)
 
 
-def shared_frames(views: Mapping[str, Transforms]) -> tuple[list[int], dict[str, list[Frame]]]:
+def shared_frames(views: Mapping[str, Transforms]) -> tuple[list[int], dict[str, list[TransformsFrame]]]:
     """Numbers of the frames that all views have, in order, and each view's frames of these numbers.
 
     A frame's number is the one at the end of its particles' file name, which counts the simulation's states; else,
@@ -67,8 +67,8 @@ def shared_frames(views: Mapping[str, Transforms]) -> tuple[list[int], dict[str,
     return shared, {name: [frames[number] for number in shared] for name, frames in numbered.items()}
 
 
-def _numbered(views: Mapping[str, Transforms]) -> dict[str, dict[int, Frame]]:
-    names: tuple[Callable[[Frame], str | None], ...] = (lambda f: f.particle_path, lambda f: f.file_path)
+def _numbered(views: Mapping[str, Transforms]) -> dict[str, dict[int, TransformsFrame]]:
+    names: tuple[Callable[[TransformsFrame], str | None], ...] = (lambda f: f.particle_path, lambda f: f.file_path)
     for name_of in names:
         numbered = {view: _by_number(transforms.frames, name_of) for view, transforms in views.items()}
         known = {view: frames for view, frames in numbered.items() if frames is not None}
@@ -77,7 +77,9 @@ def _numbered(views: Mapping[str, Transforms]) -> dict[str, dict[int, Frame]]:
     return {view: dict(enumerate(transforms.frames)) for view, transforms in views.items()}
 
 
-def _by_number(frames: Sequence[Frame], name_of: Callable[[Frame], str | None]) -> dict[int, Frame] | None:
+def _by_number(
+    frames: Sequence[TransformsFrame], name_of: Callable[[TransformsFrame], str | None]
+) -> dict[int, TransformsFrame] | None:
     """The frames by the number at the end of their name; None where one has none or two have the same."""
     found = [_NUMBER.search(name_of(frame) or "") for frame in frames]
     numbered = {int(match[1]): frame for match, frame in zip(found, frames) if match}
@@ -89,11 +91,11 @@ def intrinsics(path: Path, camera_angle_x: float, size: tuple[int, int]) -> NDAr
     width, height = size
     focal = 0.5 * width / np.tan(0.5 * camera_angle_x)
     if not 0 < focal <= LARGEST:
-        raise SplashbenchError(f"{path}: camera_angle_x {camera_angle_x:g} is no angle of view; mend the entry")
+        raise SplashbenchError(f"{path}: camera_angle_x {camera_angle_x:g} is no angle of view; fix the entry")
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
-def world_to_camera(path: Path, frames: Sequence[Frame]) -> NDArray[np.float64]:
+def world_to_camera(path: Path, frames: Sequence[TransformsFrame]) -> NDArray[np.float64]:
     """w2c [4, 4] in OpenCV's convention of the camera of `frames`, which must stand still.
 
     A camera object that is scaled in Blender leaves its scale in the matrix; directions are the same without it.

@@ -1,7 +1,7 @@
 """Scoring: Submission -> Result by one fixed protocol (paper, "Metrics"; every choice: docs/protocol.md).
 
 The scene is the only ground truth, test views the only images looked at, training masks the only geometry; true
-particles, where a made-up scene has them, give metrics of their own.
+particles, where a synthetic scene has them, give metrics of their own.
 """
 
 from __future__ import annotations

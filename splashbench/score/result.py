@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from splashbench.files import read_model, write_model
@@ -156,3 +157,15 @@ def metric_value(
         views=views or {},
         frames=frames,
     )
+
+
+def frame_mean(name: str, frames: list[float | None], reason: str) -> MetricValue:
+    """Metric `name` as the mean over the frames that have a value; null for `reason` where none has."""
+    skipped = sum(value is None for value in frames)
+    return metric_value(name, mean(frames), reason, skipped_frames=skipped, frames=tuple(frames))
+
+
+def mean(values: list[float | None]) -> float | None:
+    """Mean of the values that are there, None where none is."""
+    numbers = [value for value in values if value is not None]
+    return float(np.mean(numbers)) if numbers else None

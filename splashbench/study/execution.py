@@ -24,7 +24,7 @@ from splashbench.files import require_folder_place, write_model, write_text
 from splashbench.harness.messages import DISK_FULL_EXIT
 from splashbench.score.image.lpips import load_lpips
 from splashbench.study.job import ERROR, Job, RunEntry, Store, carry_out
-from splashbench.study.plan import Plan, PlannedRun
+from splashbench.study.plan import PlannedRun, StudyPlan
 
 _MARK = ".splashbench_study"
 _POLL_SECONDS = 0.1
@@ -59,7 +59,7 @@ class Tally:
     kept: int = 0
 
 
-def carry_out_plan(plan: Plan, out: Path, options: ExecutionOptions) -> Tally:
+def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tally:
     """Make every run of `plan` that is not in the folder `out` yet.
 
     Raises SplashbenchError where `out` is another's, or another process is at it, or the disk is full.
@@ -100,7 +100,7 @@ def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) ->
     )
 
 
-def _job(plan: Plan, run: PlannedRun, out: Path, options: ExecutionOptions, is_reference: bool) -> Job:
+def _job(plan: StudyPlan, run: PlannedRun, out: Path, options: ExecutionOptions, is_reference: bool) -> Job:
     return Job(
         digest=run.digest,
         title=f"{run.scene.name}__{run.variant.name}__seed{run.seed}__{run.digest[:8]}",
@@ -122,7 +122,7 @@ def _job(plan: Plan, run: PlannedRun, out: Path, options: ExecutionOptions, is_r
     )
 
 
-def _seconds_before(plan: Plan, store: Store) -> list[float]:
+def _seconds_before(plan: StudyPlan, store: Store) -> list[float]:
     """What the runs that are there took."""
     entries = [store.entry(run.digest) for run in plan.runs]
     return [entry.seconds for entry in entries if entry is not None and entry.status != ERROR]

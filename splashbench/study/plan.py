@@ -57,7 +57,7 @@ class PlannedRun:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """All runs of a study, and the control runs they are measured against (those of changed scenes are in no row)."""
 
     spec: StudySpec
@@ -73,7 +73,7 @@ class Plan:
         return tuple(run for run in self.references if not run.variant.perturbation and run.variant.train_views is None)
 
 
-def make_plan(spec: StudySpec) -> Plan:
+def make_plan(spec: StudySpec) -> StudyPlan:
     """The runs of `spec`, seed by seed. Everything that can be wrong before a run starts is found here.
 
     Raises SplashbenchError, one line, for a missing scene, an unknown method, preset or setting.
@@ -106,7 +106,7 @@ def make_plan(spec: StudySpec) -> Plan:
                 )
     own = load_method(spec.method)
     preset = spec.preset or next(iter(own.Config.presets))
-    return Plan(spec, own, preset, scenes, tuple(references.values()), tuple(runs))
+    return StudyPlan(spec, own, preset, scenes, tuple(references.values()), tuple(runs))
 
 
 class _MethodChoice(NamedTuple):

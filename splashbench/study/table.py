@@ -15,7 +15,7 @@ import pandas as pd
 
 from splashbench.score import Result
 from splashbench.study.job import RunEntry, Store
-from splashbench.study.plan import Plan, PlannedRun
+from splashbench.study.plan import PlannedRun, StudyPlan
 from splashbench.study.spec import DERIVED, StudySpec, metric_of
 
 #: The status of a run that has not been made.
@@ -124,7 +124,7 @@ class Table:
         scenes_of: the scenes that a metric is averaged over, by name.
     """
 
-    plan: Plan
+    plan: StudyPlan
     rows: tuple[TableRow, ...]
     run_frame: pd.DataFrame
     figures: pd.DataFrame
@@ -145,7 +145,7 @@ class Table:
         return next(row for row in self.rows if row.name == self.plan.spec.baseline)
 
 
-def make_table(plan: Plan, store: Store) -> Table:
+def make_table(plan: StudyPlan, store: Store) -> Table:
     """The table of what is in `store` by now."""
     spec = plan.spec
     planned = {v.name: (v.note, [run for run in plan.runs if run.variant.name == v.name]) for v in spec.variants}

@@ -30,7 +30,7 @@ from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.external.importers import Importer, load_importer, registered_importers
 from splashbench.observe import initial_points
 from splashbench.scene import Camera, Scene
-from splashbench.scene.exporting import export_scene
+from splashbench.scene.export import export_scene
 from splashbench.submission import Submission
 from splashbench.synth.balls import write_balls_scene
 from splashbench_methods.deformable_3dgs.official import OfficialDeformable3DGS

@@ -25,7 +25,7 @@ from splashbench.harness.external.runner import ExternalCode
 from splashbench.harness.messages import Failure
 from splashbench.observe import initial_points
 from splashbench.scene import Scene
-from splashbench.scene.exporting import export_scene
+from splashbench.scene.export import export_scene
 from splashbench.submission import Status, Submission, check_submission
 
 CODE = Path(__file__).with_name("external_code.py")

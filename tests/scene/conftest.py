@@ -1,4 +1,4 @@
-"""A made-up scene in NeuroFluid's layout: a falling ball of liquid, drawn here by formula and by nothing of ours."""
+"""A synthetic scene in NeuroFluid's layout: a falling ball of liquid, drawn here by formula and by nothing of ours."""
 
 from __future__ import annotations
 

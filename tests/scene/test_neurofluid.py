@@ -12,7 +12,7 @@ from PIL import Image
 from splashbench.errors import SplashbenchError
 from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Scene
-from splashbench.scene.checking import check_scene, describe_scene
+from splashbench.scene.inspection import check_scene, describe_scene
 from splashbench.study.scenes import changed_scene
 from splashbench.study.spec import StudyVariant
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
-from splashbench.scene.checking import check_scene, describe_scene
+from splashbench.scene.inspection import check_scene, describe_scene
 from splashbench.synth.balls import ball_centers
 
 

@@ -14,7 +14,7 @@ from splashbench.score import METRICS, PROTOCOL_V1, Result
 from splashbench.score.notation import FILTER_MARK, FILTER_NOTE
 from splashbench.score.result import Digests, metric_value
 from splashbench.study.job import RunEntry, Store
-from splashbench.study.plan import Plan, PlannedRun, make_plan
+from splashbench.study.plan import PlannedRun, StudyPlan, make_plan
 from splashbench.study.report import runs_csv, table_csv, write_report
 from splashbench.study.spec import StudySpec
 from splashbench.study.table import Table, make_table
@@ -33,7 +33,7 @@ PSNR: dict[str, dict[str, list[float | None]]] = {
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
+def plan(tmp_path_factory: pytest.TempPathFactory) -> StudyPlan:
     scenes = {name: tmp_path_factory.mktemp("two") / name for name in ("a", "b")}
     for seed, directory in enumerate(scenes.values()):
         write_balls_scene(directory, size=(24, 16), n_frames=2, seed=seed)
@@ -58,12 +58,12 @@ def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
 
 
 @pytest.fixture
-def store(plan: Plan, tmp_path: Path) -> Store:
+def store(plan: StudyPlan, tmp_path: Path) -> Store:
     """The folder of a study with every run made; one crashed."""
     return _made(plan, tmp_path)
 
 
-def _made(plan: Plan, directory: Path, mixed: str = "") -> Store:
+def _made(plan: StudyPlan, directory: Path, mixed: str = "") -> Store:
     """mixed: the variant that is said to be of a mixed method."""
     store = Store(directory)
     for run in plan.runs:
@@ -103,7 +103,7 @@ def _put(store: Store, run: PlannedRun, psnr: float | None, mixed: bool) -> None
 
 
 @pytest.fixture
-def table(plan: Plan, store: Store) -> Table:
+def table(plan: StudyPlan, store: Store) -> Table:
     return make_table(plan, store)
 
 
@@ -133,7 +133,7 @@ def test_a_metric_is_averaged_over_the_scenes_that_can_have_it(table: Table) -> 
     assert table.rows[0].cells["sigma_mu_ratio"].mean == pytest.approx(0.25)
 
 
-def test_runs_that_are_not_made_leave_gaps_and_no_means(plan: Plan, store: Store) -> None:
+def test_runs_that_are_not_made_leave_gaps_and_no_means(plan: StudyPlan, store: Store) -> None:
     (gone,) = [run for run in plan.runs if (run.variant.name, run.scene.name, run.seed) == ("dark", "b", 0)]
     store.entry_path(gone.digest).unlink()
     row = make_table(plan, store).rows[1]
@@ -192,7 +192,7 @@ def test_csv_and_json_hold_the_same_figures(table: Table, tmp_path: Path) -> Non
     assert (failed["variant"], failed["seed"], failed["psnr"], failed["reason"]) == ("per_frame", "1", "", "it | broke")
 
 
-def test_figures_of_mixed_methods_that_rest_on_the_filter_are_marked(plan: Plan, tmp_path: Path) -> None:
+def test_figures_of_mixed_methods_that_rest_on_the_filter_are_marked(plan: StudyPlan, tmp_path: Path) -> None:
     table = make_table(plan, _made(plan, tmp_path / "store", mixed="dark"))
     text = to_markdown(table, COMMAND)
     assert FILTER_NOTE in text

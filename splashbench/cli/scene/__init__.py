@@ -111,7 +111,7 @@ def _not_negative(text: str) -> int:
 
 def check(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene check`."""
-    from splashbench.scene.checking import check_scene
+    from splashbench.scene.inspection import check_scene
 
     faults = check_scene(arguments.scene)
     if arguments.json:
@@ -126,7 +126,7 @@ def check(arguments: argparse.Namespace) -> int:
 def info(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene info`."""
     from splashbench.scene import Scene
-    from splashbench.scene.checking import describe_scene
+    from splashbench.scene.inspection import describe_scene
 
     facts = describe_scene(Scene.open(arguments.scene))
     if arguments.json:
@@ -141,7 +141,7 @@ def export(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene export`."""
     from splashbench.observe import initial_points
     from splashbench.scene import Scene
-    from splashbench.scene.exporting import export_scene, remarks
+    from splashbench.scene.export import export_scene, remarks
 
     scene = Scene.open(arguments.scene)
     facts = export_scene(

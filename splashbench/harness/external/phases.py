@@ -20,7 +20,7 @@ from splashbench.harness.process import Watched, watch
 from splashbench.harness.runner import particles_per_frame, run_phase
 from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Scene
-from splashbench.scene.exporting import TEST_VIEWS, InitialPoints, export_scene
+from splashbench.scene.export import TEST_VIEWS, InitialPoints, export_scene
 from splashbench.submission import Record, Status
 
 #: Deformable-3DGS looks at the parent's name to tell which kind of nerfies dataset it is given.
@@ -34,7 +34,7 @@ class ExternalCode:
 
     Attributes:
         name, version, mixed: what the submission says of the method (docs/submission_format.md).
-        format: of the export it trains on, one of scene.exporting.FORMATS.
+        format: of the export it trains on, one of scene.export.FORMATS.
         command: fits the scene; placeholders are those of commands.PLACEHOLDERS. "" with `trained`.
         trained: a folder that the command left as `{out}` on an earlier day, for an importer or `render_command` to
             read; the fit is then not measured. None where `command` is run.

@@ -23,7 +23,7 @@ from splashbench.harness.external.phases import ExternalCode, ExternalRun
 from splashbench.harness.messages import Failure
 from splashbench.harness.runner import TIMING_FRAMES, drop_unwanted, require_unchanged, without_nulls
 from splashbench.scene import Scene
-from splashbench.scene.exporting import InitialPoints
+from splashbench.scene.export import InitialPoints
 from splashbench.submission import IDENTITY, Identity, Submission, identity_text, seal
 from splashbench.version import __version__
 

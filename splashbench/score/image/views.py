@@ -17,7 +17,7 @@ from splashbench.score.image.fidelity import Image, outside_filled, psnr, ssim
 from splashbench.score.image.jitter import JitterError
 from splashbench.score.image.lpips import Lpips
 from splashbench.score.image.silhouette import iou, spill, spill_rgb
-from splashbench.score.result import MetricValue, ViewValues, metric_value
+from splashbench.score.result import MetricValue, ViewValues, mean, metric_value
 from splashbench.score.settings import Protocol
 from splashbench.submission.withheld import scored_timesteps
 
@@ -127,19 +127,14 @@ def _averaged(name: str, views: dict[str, list[float | None]], reason: str, left
 
     left_out: frames of all views that were not to be scored, which are not skipped ones.
     """
-    detailed = {camera: ViewValues(value=_mean(frames), frames=tuple(frames)) for camera, frames in views.items()}
+    detailed = {camera: ViewValues(value=mean(frames), frames=tuple(frames)) for camera, frames in views.items()}
     skipped = sum(frame is None for frames in views.values() for frame in frames) - left_out
-    value = _mean([view.value for view in detailed.values()])
+    value = mean([view.value for view in detailed.values()])
     return metric_value(name, value, reason, skipped_frames=skipped, views=detailed)
 
 
 def _jitter_value(jitter: dict[str, float | None]) -> MetricValue:
     views = {camera: ViewValues(value=value) for camera, value in jitter.items()}
     return metric_value(
-        "jitter_error", _mean(list(jitter.values())), "no test view has two frames with liquid", views=views
+        "jitter_error", mean(list(jitter.values())), "no test view has two frames with liquid", views=views
     )
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None

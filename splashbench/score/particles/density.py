@@ -18,7 +18,7 @@ Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Density:
+class DensityStatistics:
     """Density over the particles of one frame: standard deviation, mean, and how many were evaluated."""
 
     sigma: float
@@ -40,7 +40,7 @@ def poly6_densities(points: Points, protocol: Protocol = PROTOCOL_V1) -> NDArray
     return 315.0 / (64.0 * np.pi * h**9) * nearest_poly6_sums(points, protocol.neighbours, h)
 
 
-def frame_density(points: Points, t: int, protocol: Protocol = PROTOCOL_V1) -> Density | None:
+def frame_density(points: Points, t: int, protocol: Protocol = PROTOCOL_V1) -> DensityStatistics | None:
     """Density statistics of the particles [N, 3] of frame `t`, in units where the released scenes' h holds.
 
     More than `particle_cap` particles are subsampled, and the statistics averaged over the seeds. Too few particles for
@@ -51,11 +51,11 @@ def frame_density(points: Points, t: int, protocol: Protocol = PROTOCOL_V1) -> D
     points = points[np.lexsort(points.T)]
     if len(points) <= protocol.particle_cap:
         densities = poly6_densities(points, protocol)
-        return Density(float(densities.std()), float(densities.mean()), len(points))
+        return DensityStatistics(float(densities.std()), float(densities.mean()), len(points))
     sigmas, mus = [], []
     for seed in range(protocol.subsample_seeds):
         chosen = np.random.default_rng([seed, t]).choice(len(points), protocol.particle_cap, replace=False)
         densities = poly6_densities(points[chosen], protocol)
         sigmas.append(densities.std())
         mus.append(densities.mean())
-    return Density(float(np.mean(sigmas)), float(np.mean(mus)), protocol.particle_cap)
+    return DensityStatistics(float(np.mean(sigmas)), float(np.mean(mus)), protocol.particle_cap)

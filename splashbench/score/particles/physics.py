@@ -11,10 +11,10 @@ from splashbench.errors import SplashbenchError
 from splashbench.scene import Particles, Scene
 from splashbench.score.image.views import Track
 from splashbench.score.mixed import liquid_of_mixed
-from splashbench.score.particles.density import Density, frame_density
+from splashbench.score.particles.density import DensityStatistics, frame_density
 from splashbench.score.particles.energy import energy_deviation
 from splashbench.score.particles.uniformity import DistanceFields, frame_uniformity
-from splashbench.score.result import MetricValue, metric_value
+from splashbench.score.result import MetricValue, frame_mean, metric_value
 from splashbench.score.settings import Protocol
 
 PARTICLE_METRICS = ("sigma_d", "mu_d", "uniformity", "delta_e")
@@ -71,7 +71,7 @@ def _density_values(
             name: metric_value(name, None, f"no hull to take the scale from: {no_distance}")
             for name in ("sigma_d", "mu_d", "uniformity")
         }
-    densities: list[Density | None] = []
+    densities: list[DensityStatistics | None] = []
     uniformity: list[float | None] = []
     for t in track(range(scene.n_frames), "scoring particles"):
         density = frame_density(particles.at(t).astype(np.float64) * scale, t, protocol)
@@ -82,16 +82,10 @@ def _density_values(
     few = f"no frame has {protocol.neighbours + 1} particles"
     thin = no_distance or f"{few}, with neighbours within h, and observed liquid thick enough for the grid"
     return {
-        "sigma_d": _over_frames("sigma_d", [d.sigma if d else None for d in densities], few),
-        "mu_d": _over_frames("mu_d", [d.mu if d else None for d in densities], few),
-        "uniformity": _over_frames("uniformity", uniformity, thin),
+        "sigma_d": frame_mean("sigma_d", [d.sigma if d else None for d in densities], few),
+        "mu_d": frame_mean("mu_d", [d.mu if d else None for d in densities], few),
+        "uniformity": frame_mean("uniformity", uniformity, thin),
     }
-
-
-def _over_frames(name: str, frames: list[float | None], reason: str) -> MetricValue:
-    known = [value for value in frames if value is not None]
-    value = float(np.mean(known)) if known else None
-    return metric_value(name, value, reason, skipped_frames=len(frames) - len(known), frames=tuple(frames))
 
 
 def _energy_value(scene: Scene, particles: Particles, protocol: Protocol) -> MetricValue:

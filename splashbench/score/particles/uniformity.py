@@ -11,7 +11,7 @@ from typing import Protocol as TypingProtocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.score.particles.density import Density, Points, frame_density
+from splashbench.score.particles.density import DensityStatistics, Points, frame_density
 from splashbench.score.settings import PROTOCOL_V1, Protocol
 
 # A node's phi and that of a point in the cell around it differ by at most half a cell's diagonal.
@@ -63,7 +63,7 @@ def shell_points(fields: DistanceFields, t: int, count: int, depth: float) -> Po
 
 
 def frame_uniformity(
-    density: Density, fields: DistanceFields, t: int, scale: float, protocol: Protocol = PROTOCOL_V1
+    density: DensityStatistics, fields: DistanceFields, t: int, scale: float, protocol: Protocol = PROTOCOL_V1
 ) -> float | None:
     """UI of one frame, or None where it has no meaning (no neighbours, or liquid too thin for the grid).
 

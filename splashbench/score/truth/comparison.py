@@ -1,4 +1,4 @@
-"""Metrics against the true particles of a made-up scene: geometry and motion (docs/protocol.md, "Against the truth").
+"""Metrics against the true particles of a synthetic scene: geometry and motion (docs/protocol.md, "Against the truth").
 
 The grid is the one that the training masks give (observe/signed_distance.py), and every length is in its voxels. What
 the reconstruction is: the signed distance that the submission hands in, else the liquid that its particles stand for.
@@ -21,7 +21,7 @@ from splashbench.score.image.views import Track
 from splashbench.score.metrics import TRUTH_METRICS
 from splashbench.score.particles.surface import particle_distance, spacing
 from splashbench.score.particles.uniformity import DistanceFields
-from splashbench.score.result import MetricValue, metric_value
+from splashbench.score.result import MetricValue, frame_mean, metric_value
 from splashbench.score.settings import PROTOCOL_V1, Protocol
 from splashbench.score.truth.level_set import Field, chamfer, filled, overlap, resampled, surface_points
 from splashbench.score.truth.motion import FrameMotion, frame_motion, free_flight, known_velocities, relative
@@ -126,7 +126,7 @@ def score_ground_truth(
         empty = "no frame has true liquid that the grid can show"
         if any(shapes):  # precision alone may be missing then
             empty = "nothing is reconstructed where there is true liquid to compare"
-        values = {name: _mean(name, [shape.get(name) for shape in shapes], empty) for name in GEOMETRY_METRICS}
+        values = {name: frame_mean(name, [shape.get(name) for shape in shapes], empty) for name in GEOMETRY_METRICS}
     return values | (_null(MOTION_METRICS, no_motion) if no_motion else _motion_values(motions, no_flight))
 
 
@@ -205,12 +205,6 @@ def _motion(
         _nodes(particles.positions[t, rows], grid),
         velocities * per_step,
     )
-
-
-def _mean(name: str, frames: list[float | None], reason: str) -> MetricValue:
-    known = [value for value in frames if value is not None]
-    value = float(np.mean(known)) if known else None
-    return metric_value(name, value, reason, skipped_frames=len(frames) - len(known), frames=tuple(frames))
 
 
 def _motion_values(motions: list[FrameMotion], no_flight: str) -> dict[str, MetricValue]:

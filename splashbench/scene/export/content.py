@@ -28,8 +28,8 @@ MAX_STATIC = 100_000
 MAX_STATIC_PER_FRAME = 10_000
 
 
-def most_static(format_name: str) -> int:
-    """Static points at most, in the export or, of `colmap`, in each of its timesteps."""
+def max_static(format_name: str) -> int:
+    """The largest number of static points in the export or, of `colmap`, in each of its timesteps."""
     return MAX_STATIC_PER_FRAME if format_name == "colmap" else MAX_STATIC
 
 
@@ -76,14 +76,14 @@ class InitialPoints:
         return np.concatenate([thinned(self.static, MAX_STATIC_PER_FRAME), self.liquid[t]])
 
 
-def thinned(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """At most `most` of `points` [N, D], evenly through the array."""
-    if len(points) <= most:
+def thinned(points: NDArray[np.float64], limit: int) -> NDArray[np.float64]:
+    """At most `limit` of `points` [N, D], evenly through the array."""
+    if len(points) <= limit:
         return points
-    return points[np.linspace(0, len(points) - 1, most).round().astype(int)]
+    return points[np.linspace(0, len(points) - 1, limit).round().astype(int)]
 
 
-class View(NamedTuple):
+class ExportView(NamedTuple):
     """One photograph: camera, timestep, and when it was taken, in seconds and in [0, 1]."""
 
     camera: Camera
@@ -108,30 +108,30 @@ class Export:
     test_images: TestImages = "none"
     masks: bool = False
 
-    def views(self, names: Sequence[str]) -> list[View]:
+    def views(self, names: Sequence[str]) -> list[ExportView]:
         """The views of the cameras `names`, all of a camera's after one another."""
         cameras, times = self.scene.cameras, self.scene.camera_times
         return [
-            View(cameras[name], t, float(times[name][t]), self.clock.unit(float(times[name][t])))
+            ExportView(cameras[name], t, float(times[name][t]), self.clock.unit(float(times[name][t])))
             for name in names
             for t in range(self.scene.n_frames)
         ]
 
     @property
-    def train_views(self) -> list[View]:
+    def train_views(self) -> list[ExportView]:
         """Views that have images and are trained on."""
         return self.views(self.scene.train)
 
     @property
-    def test_views(self) -> list[View]:
+    def test_views(self) -> list[ExportView]:
         """Views that are to be rendered."""
         return self.views(self.scene.test)
 
-    def has_image(self, view: View) -> bool:
+    def has_image(self, view: ExportView) -> bool:
         """Whether `view` has an image file in this export."""
         return self.test_images != "none" or view.camera.name in self.scene.train
 
-    def has_mask(self, view: View) -> bool:
+    def has_mask(self, view: ExportView) -> bool:
         """Whether `view` has a mask file in this export. A test mask is ground truth, as a test image is."""
         return self.masks and (self.test_images == "true" or view.camera.name in self.scene.train)
 
@@ -149,7 +149,7 @@ class Export:
                 mask = np.where(self.scene.mask(view.camera.name, view.t), 255, 0).astype(np.uint8)
                 write_png(self.directory / mask_folder.format(**words) / name.format(**words), mask)
 
-    def image(self, view: View) -> NDArray[np.uint8]:
+    def image(self, view: ExportView) -> NDArray[np.uint8]:
         """sRGB uint8 [H, W, 3] of `view`; black where a test view's image is blank."""
         if view.camera.name in self.scene.train or self.test_images == "true":
             return self.scene.image(view.camera.name, view.t)

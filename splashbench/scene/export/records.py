@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from splashbench.scene.camera import Camera
-from splashbench.scene.exporting.export import Export, TestImages, most_static
+from splashbench.scene.export.content import Export, TestImages, max_static
 
 #: By which an export is told from any other folder.
 FACTS = "splashbench.json"
@@ -18,7 +18,7 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Facts(_Strict):
+class ExportFacts(_Strict):
     """splashbench.json: what an export is of, for whoever reads the results that a code makes from it.
 
     time_origin_seconds, time_span_seconds: a time t in [0, 1] is origin + t * span seconds on the scene's clock.
@@ -96,10 +96,10 @@ def _wanted_camera(camera: Camera) -> WantedCamera:
     return WantedCamera(width=camera.width, height=camera.height, K=camera.K.tolist(), w2c=camera.w2c.tolist())
 
 
-def facts(export: Export, format_name: str) -> Facts:
+def export_facts(export: Export, format_name: str) -> ExportFacts:
     """splashbench.json of `export`."""
     scene = export.scene
-    return Facts(
+    return ExportFacts(
         format=format_name,
         scene=scene.name,
         scene_digest=scene.digest,
@@ -111,6 +111,6 @@ def facts(export: Export, format_name: str) -> Facts:
         time_span_seconds=export.clock.span,
         test_images=export.test_images,
         masks=export.masks,
-        static_points=min(len(export.points.static), most_static(format_name)),
+        static_points=min(len(export.points.static), max_static(format_name)),
         liquid_points=sum(len(points) for points in export.points.liquid),
     )

@@ -9,14 +9,14 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, write_model
-from splashbench.scene.exporting.colmap import nearest_rotation, write_colmap
-from splashbench.scene.exporting.export import Clock, Export, InitialPoints, TestImages, most_static
-from splashbench.scene.exporting.nerfies import write_nerfies
-from splashbench.scene.exporting.records import FACTS, TEST_VIEWS, Facts, WantedViews, facts
-from splashbench.scene.exporting.transforms import write_blender, write_nerfstudio
+from splashbench.scene.export.colmap import nearest_rotation, write_colmap
+from splashbench.scene.export.content import Clock, Export, InitialPoints, TestImages, max_static
+from splashbench.scene.export.nerfies import write_nerfies
+from splashbench.scene.export.records import FACTS, TEST_VIEWS, ExportFacts, WantedViews, export_facts
+from splashbench.scene.export.transforms import write_blender, write_nerfstudio
 from splashbench.scene.scene import Scene
 
-__all__ = ["FACTS", "FORMATS", "TEST_VIEWS", "Facts", "InitialPoints", "WantedViews", "export_scene", "remarks"]
+__all__ = ["FACTS", "FORMATS", "TEST_VIEWS", "ExportFacts", "InitialPoints", "WantedViews", "export_scene", "remarks"]
 
 FORMATS: dict[str, Callable[[Export], None]] = {
     "nerfies": write_nerfies,
@@ -45,7 +45,7 @@ def export_scene(
     test_images: TestImages = "none",
     masks: bool = False,
     replace: bool = False,
-) -> Facts:
+) -> ExportFacts:
     """Write `scene` into the folder `out` as the code of `format_name` (of FORMATS) reads it.
 
     Args:
@@ -64,28 +64,28 @@ def export_scene(
         export = Export(scene, staging, points, Clock.of(scene), test_images, masks)
         FORMATS[format_name](export)
         write_model(staging / TEST_VIEWS, WantedViews.of(export))
-        written = facts(export, format_name)
+        written = export_facts(export, format_name)
         write_model(staging / FACTS, written)
     return written
 
 
 def remarks(scene: Scene, format_name: str, out: Path) -> list[str]:
     """What the user of an export should know: where the scene says more than the format, or than its readers read."""
-    found = []
+    lines = []
     if scene.times_source == "nominal":
-        found.append("the scene has no timestamps; times are an order, not seconds")
-    static, most = scene.initial_points(), most_static(format_name)
-    if static is not None and len(static) > most:
+        lines.append("the scene has no timestamps; times are an order, not seconds")
+    static, limit = scene.initial_points(), max_static(format_name)
+    if static is not None and len(static) > limit:
         each = " in each timestep" if format_name == "colmap" else ""
-        found.append(f"{most} of the {len(static)} static points are written{each}, evenly chosen")
+        lines.append(f"{limit} of the {len(static)} static points are written{each}, evenly chosen")
     if format_name == "colmap":
         steps = np.diff(np.stack([scene.camera_times[name] for name in scene.cameras]), axis=1)
         uneven = float(np.abs(steps / steps.mean() - 1).max()) if steps.size else 0.0
-        delay = max(float(np.abs(own - scene.times).max()) for own in scene.camera_times.values())
+        delay = max(float(np.abs(times - scene.times).max()) for times in scene.camera_times.values())
         if uneven > _UNEVEN:
-            found.append(f"COLMAP's layout counts frames: steps that are uneven by up to {uneven:.0%} become even")
+            lines.append(f"COLMAP's layout counts frames: steps that are uneven by up to {uneven:.0%} become even")
         if steps.size and delay > _UNEVEN * steps.mean():
-            found.append(
+            lines.append(
                 f"COLMAP's layout has one time per frame: cameras that expose up to {1000 * delay:.1f} ms apart from "
                 "the scene's times become simultaneous"
             )
@@ -94,13 +94,13 @@ def remarks(scene: Scene, format_name: str, out: Path) -> list[str]:
             for camera in scene.cameras.values()
         )
         if moved > _PIXEL:
-            found.append(f"w2c is a rotation to rounding only; COLMAP's quaternions move pixels by up to {moved:.2f}")
+            lines.append(f"w2c is a rotation to rounding only; COLMAP's quaternions move pixels by up to {moved:.2f}")
     off = max(
         float(np.hypot(camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2))
         for camera in scene.cameras.values()
     )
     if off > _OFF_CENTRE and format_name in _ON_PRINCIPAL_POINTS:
-        found.append(f"principal points lie up to {off:.1f} pixels off the middle; {_ON_PRINCIPAL_POINTS[format_name]}")
+        lines.append(f"principal points lie up to {off:.1f} pixels off the middle; {_ON_PRINCIPAL_POINTS[format_name]}")
     if format_name == "nerfies" and not Path(out).resolve().parent.name.startswith("NeRF"):
-        found.append("Deformable-3DGS reads this layout only from a folder whose parent's name begins with NeRF")
-    return found
+        lines.append("Deformable-3DGS reads this layout only from a folder whose parent's name begins with NeRF")
+    return lines

@@ -17,7 +17,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, write_json
 from splashbench.observe import initial_points
 from splashbench.scene import Scene
-from splashbench.scene.exporting import FORMATS, InitialPoints, export_scene, remarks
+from splashbench.scene.export import FORMATS, InitialPoints, export_scene, remarks
 from splashbench.synth.balls import _RADII, ball_centers, write_balls_scene
 
 #: Known points about the liquid, on no axis of anything.

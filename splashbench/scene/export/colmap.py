@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from splashbench.progress import track
 from splashbench.scene.camera import Camera
-from splashbench.scene.exporting.export import Export, pinhole
+from splashbench.scene.export.content import Export, pinhole
 
 
 def write_colmap(export: Export) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, write_json
 from splashbench.scene.camera import Camera
-from splashbench.scene.exporting.export import Export, View
+from splashbench.scene.export.content import Export, ExportView
 
 # The middle of the depths is where the scene is; single stray points must not set the planes.
 _DEPTH_PERCENTILES = (0.1, 99.9)
@@ -71,7 +71,7 @@ def camera_json(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _metadata(export: Export, view: View) -> dict[str, int]:
+def _metadata(export: Export, view: ExportView) -> dict[str, int]:
     """Numbers of embeddings. time_id, of which Deformable-3DGS takes the share of the largest, has the true time."""
     return {
         "warp_id": view.t,

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from splashbench.files import write_json
-from splashbench.scene.exporting.export import Export, View, pinhole
-from splashbench.scene.exporting.ply import write_ply
+from splashbench.scene.export.content import Export, ExportView, pinhole
+from splashbench.scene.export.ply import write_ply
 
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _POINTS = "points3d.ply"
@@ -52,11 +52,11 @@ def write_nerfstudio(export: Export) -> None:
     write_ply(export.directory / _POINTS, export.points.cloud())
 
 
-def _path(view: View, ending: str) -> str:
+def _path(view: ExportView, ending: str) -> str:
     return f"images/{view.id}{ending}"
 
 
-def _clocked(export: Export, views: Sequence[View], ending: str, blender: bool = False) -> dict[str, Any]:
+def _clocked(export: Export, views: Sequence[ExportView], ending: str, blender: bool = False) -> dict[str, Any]:
     """The content of a transforms file: the clock, and a frame per view."""
     content: dict[str, Any] = {
         "time_origin_seconds": export.clock.origin,
@@ -68,7 +68,7 @@ def _clocked(export: Export, views: Sequence[View], ending: str, blender: bool =
     return content | {"frames": [_frame(export, view, ending) for view in views]}
 
 
-def _frame(export: Export, view: View, ending: str) -> dict[str, Any]:
+def _frame(export: Export, view: ExportView, ending: str) -> dict[str, Any]:
     camera = view.camera
     fx, fy, cx, cy = pinhole(camera)
     frame = {
