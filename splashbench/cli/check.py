@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splashbench.cli.output import add_json, emit, say
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say
 
 _EPILOG = """\
 example:
@@ -15,17 +16,16 @@ example:
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "check",
-        help="look a submission over",
+        run,
+        summary="list every fault of a submission",
         description="List every fault of SUBMISSION: changed or missing files, wrong sizes, missing frames.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("submission", type=Path, help="folder of the submission")
+    parser.add_argument("submission", type=Path, metavar="SUBMISSION", help="folder of the submission")
     parser.add_argument("--scene", type=Path, help="the scene it was made for: sizes and frames are checked against it")
-    add_json(parser)
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from splashbench.cli.output import add_json, emit, say, table
+from splashbench.cli.arguments import add_seed
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say, table
 
 _EPILOG = """\
 example:
@@ -38,24 +40,17 @@ _RUNS: tuple[tuple[str, list[str]], ...] = (
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "demo",
-        help="the whole road once: film, prepare, reconstruct, score, chart",
-        description="Make up a recording of a pour, prepare it, reconstruct it, score it and draw the leaderboard.",
+        run,
+        summary="every step once on a synthetic pour: film, prepare, reconstruct, score, chart",
+        description="Film a synthetic pour, prepare it, reconstruct it, score it and draw the leaderboard.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("out", type=Path, help="folder for everything the demo makes")
-    parser.add_argument("--seed", type=_seed, default=0, help="seed of the made-up pour and of the methods")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder for everything the demo makes")
+    add_seed(parser, "seed of the synthetic pour and of the methods")
     parser.add_argument("--fresh", action="store_true", help="make everything anew, also what is there already")
-    add_json(parser)
-    parser.set_defaults(handler=run)
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
-    return int(text)
 
 
 def run(arguments: argparse.Namespace) -> int:

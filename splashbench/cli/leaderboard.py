@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splashbench.cli.output import add_json, emit, say
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say
 
 _EPILOG = """\
 examples:
@@ -19,18 +20,17 @@ runs on different machines never share a chart. The same results give the same b
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "leaderboard",
-        help="table and charts from results",
+        run,
+        summary="make tables and charts from results",
         description="Make a leaderboard (CSV, Markdown) and the speed-accuracy chart (PNG, SVG) from results.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("results", type=Path, metavar="RESULTS", help="folder with results, from `splashbench score`")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder the leaderboard is written into")
     parser.add_argument("--with-paper", action="store_true", help="the paper's figures, as reported, beside them")
-    add_json(parser)
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

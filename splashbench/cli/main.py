@@ -15,22 +15,26 @@ import sys
 import warnings
 from contextlib import suppress
 
+from splashbench.cli.command import unknown_command
 from splashbench.errors import SplashbenchError, one_line
 from splashbench.processes import Terminated, terminable
 from splashbench.version import __version__
 
 #: In the order of the work: session, scene, method, submission, result.
-COMMANDS = ("demo", "synth", "prepare", "masks", "scene", "methods", "run", "check", "score", "leaderboard", "study")
+COMMANDS = (
+    *("demo", "synth", "prepare", "masks", "scene", "methods", "run", "run-external", "check", "score"),
+    *("leaderboard", "study"),
+)
 
 _EPILOG = """\
 the usual order:
-  splashbench demo OUT                              all of the following, on a made-up pour
-  splashbench synth session SESSION                 a made-up recording with exact ground truth
+  splashbench demo OUT                              all of the following, on a synthetic pour
+  splashbench synth session SESSION                 a synthetic recording with exact ground truth
   splashbench prepare SESSION SCENE                 calibrate, synchronise, mask, crop
   splashbench run splashsplat SCENE SUBMISSION      reconstruct
   splashbench score SUBMISSION --scene SCENE --out RESULTS
   splashbench leaderboard RESULTS OUT               CSV, table and charts
-  splashbench study ablate ablation OUT --scenes SCENE...    many runs in one table
+  splashbench study run ablation OUT --scenes SCENE...       many runs in one table
 """
 
 
@@ -45,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"splashbench {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name in COMMANDS:
-        importlib.import_module(f"splashbench.cli.{name}").register(subparsers)
+        importlib.import_module(f"splashbench.cli.{name.replace('-', '_')}").register(subparsers)
     return parser
 
 
@@ -60,7 +64,11 @@ def main(argv: list[str] | None = None) -> int:
     warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
     try:
         with terminable():
-            arguments = build_parser().parse_args(argv)
+            parser = build_parser()
+            fault = unknown_command(parser, sys.argv[1:] if argv is None else argv)
+            if fault:
+                return _fail(fault, status=2)
+            arguments = parser.parse_args(argv)
             status = int(arguments.handler(arguments))
             _flush()
             return status
@@ -102,10 +110,10 @@ def _drop_output() -> None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
-def _fail(message: str) -> int:
+def _fail(message: str, status: int = 1) -> int:
     with suppress(BrokenPipeError):
         print(f"error: {one_line(message)}", file=sys.stderr)
-    return 1
+    return status
 
 
 if __name__ == "__main__":

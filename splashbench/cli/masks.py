@@ -9,72 +9,69 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splashbench.cli.output import add_json, emit, say, table
+from splashbench.cli.arguments import add_replace, whole_number
+from splashbench.cli.command import add_command, add_group
+from splashbench.cli.output import emit, say, table
 
 if TYPE_CHECKING:
     from splashbench.prepare.masks.comparison import MaskChange
 
-_EPILOG = """\
-examples:
+_MASKS = "Masks are those of a scene (its seg/), or a folder of <camera>/<frame>.png, white where there is liquid.\n"
+
+_COMPARE_EXAMPLES = """\
   splashbench masks compare sam3_masks scenes/bowl_001 --out comparison
   splashbench masks compare scenes_raw scenes_refined        a folder of scenes each: per scene and overall
-  splashbench masks sheet scenes/bowl_001 --out sheet.png
-  splashbench masks sheet sam3_masks --images frames --out sheet.png
-
-Masks are those of a scene (its seg/), or a folder of <camera>/<frame>.png, white where there is liquid.
 """
 
-_MOST_COLUMNS = 40
+_SHEET_EXAMPLES = """\
+  splashbench masks sheet scenes/bowl_001 --out sheet.png
+  splashbench masks sheet sam3_masks --images frames --out sheet.png
+"""
+
+_MAX_COLUMNS = 40
 
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    actions = add_group(
+        subparsers,
         "masks",
-        help="compare liquid masks, or look them over",
+        summary="compare liquid masks, or draw them for a person's eye",
         description="Compare two sets of liquid masks as the paper does, or draw a contact sheet of one.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=f"examples:\n{_COMPARE_EXAMPLES}{_SHEET_EXAMPLES}\n{_MASKS}",
     )
-    actions = parser.add_subparsers(dest="action", metavar="compare|sheet", required=True)
-    comparing = actions.add_parser(
+    comparing = add_command(
+        actions,
         "compare",
-        help="raw against refined masks",
-        description="IoU mean and median, shares of the union added and removed, and empty raw masks, per camera,"
-        " per scene and overall. A frame without a file has no liquid.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        compare,
+        summary="compare raw with refined masks",
+        description="Print mean and median IoU, the shares of the union added and removed, and the share of empty raw\n"
+        "masks, per camera, per scene and overall.",
+        epilog=f"examples:\n{_COMPARE_EXAMPLES}\n{_MASKS}A frame without a file has no liquid.\n",
     )
     comparing.add_argument("raw", type=Path, metavar="RAW", help="scene, folder of masks, or folder of either")
     comparing.add_argument("refined", type=Path, metavar="REFINED", help="the same, to compare with")
     comparing.add_argument(
         "--out", type=Path, metavar="DIR", help="write masks.csv, summary.csv and a picture per scene into this folder"
     )
-    add_json(comparing)
-    comparing.set_defaults(handler=compare)
-    drawing = actions.add_parser(
+    drawing = add_command(
+        actions,
         "sheet",
-        help="a contact sheet to judge masks by eye",
-        description="Cameras in rows, instants in columns, outlines on the images; masks that are empty or cannot be"
-        " right are framed in red with the reason.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        sheet,
+        summary="draw a contact sheet to judge masks by eye",
+        description="Draw outlines on the images, cameras in rows and timesteps in columns. A mask that is empty or\n"
+        "cannot be right has a red frame and the reason.",
+        epilog=f"examples:\n{_SHEET_EXAMPLES}\n{_MASKS}",
     )
     drawing.add_argument("masks", type=Path, metavar="SCENE_OR_FOLDER", help="scene, or folder of masks")
     drawing.add_argument("--out", type=Path, metavar="SHEET.png", required=True, help="the picture to be written")
     drawing.add_argument(
         "--images", type=Path, metavar="FOLDER", help="<camera>/<frame>.png or .jpg; default: the scene's, else black"
     )
-    drawing.add_argument("--replace", action="store_true", help="replace SHEET.png where it exists")
-    drawing.add_argument("--columns", type=_columns, default=8, metavar="N", help="instants to show (default: 8)")
-    add_json(drawing)
-    drawing.set_defaults(handler=sheet)
-
-
-def _columns(text: str) -> int:
-    if not (text.isdecimal() and 1 <= int(text) <= _MOST_COLUMNS):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {_MOST_COLUMNS}")
-    return int(text)
+    drawing.add_argument(
+        "--columns", type=whole_number(1, _MAX_COLUMNS), default=8, metavar="N", help="timesteps to show (default: 8)"
+    )
+    add_replace(drawing, "SHEET.png")
 
 
 def compare(arguments: argparse.Namespace) -> int:

@@ -7,12 +7,10 @@ import json
 import sys
 from typing import Any
 
-JSON_HELP = "print one JSON object on standard output (everything for people goes to standard error)"
-
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add the `--json` flag."""
-    parser.add_argument("--json", action="store_true", help=JSON_HELP)
+    parser.add_argument("--json", action="store_true", help="print one JSON object on standard output")
 
 
 def say(text: str = "") -> None:

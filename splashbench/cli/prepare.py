@@ -6,7 +6,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from splashbench.cli.output import add_json, emit, say, table
+from splashbench.cli.arguments import add_replace, positive_number, whole_number
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say, table
 
 _EPILOG = """\
 examples:
@@ -27,7 +29,7 @@ was stopped had come to. Stages, in order: sync, motion, intrinsics, poses, metr
 """
 
 # As in session.toml (splashbench.prepare.session), repeated here so that `--help` need not import it.
-_MOST_TIMESTEPS = 10_000
+_MAX_TIMESTEPS = 10_000
 # As in splashbench.prepare.stage_cache, likewise.
 _STAGES = ("sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene")
 
@@ -46,12 +48,13 @@ class _WithoutScene(argparse.Action):
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "prepare",
-        help="make a scene from raw recordings",
+        run,
+        summary="make a scene from raw recordings",
         description="Calibrate, synchronise, sample, mask, undistort and crop the recordings of SESSION into SCENE.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("session", type=Path, metavar="SESSION", help="folder with session.toml")
     scene = parser.add_argument("scene", type=Path, metavar="SCENE", help="folder to be made")
@@ -62,7 +65,10 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         help="write SESSION/session.toml by looking at the recordings, and no scene",
     )
     parser.add_argument(
-        "--square-metres", type=_metres, metavar="M", help="with --init: side of one square of the printed board"
+        "--square-metres",
+        type=positive_number("metres", below=10),
+        metavar="M",
+        help="with --init: side of one square of the printed board",
     )
     parser.add_argument(
         "--masks",
@@ -70,7 +76,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         help="liquid masks: by background subtraction, or FOLDER/<camera>/<source frame:06d>.png of the raw frames;"
         " default: as session.toml says",
     )
-    parser.add_argument("--timesteps", type=_at_least_two, metavar="N", help="timesteps; default: as session.toml says")
+    parser.add_argument(
+        "--timesteps",
+        type=whole_number(2, _MAX_TIMESTEPS),
+        metavar="N",
+        help="timesteps; default: as session.toml says",
+    )
     parser.add_argument(
         "--interval",
         nargs=2,
@@ -88,25 +99,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         help="do this stage and those after it again, although nothing has changed",
     )
     parser.add_argument("--work", type=Path, metavar="DIR", help="where results are kept (default: SESSION/prepare)")
-    parser.add_argument("--replace", action="store_true", help="replace SCENE where it exists")
-    add_json(parser)
-    parser.set_defaults(handler=run, parser=parser)
-
-
-def _at_least_two(text: str) -> int:
-    if not (text.isdecimal() and 2 <= int(text) <= _MOST_TIMESTEPS):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 2 to {_MOST_TIMESTEPS}")
-    return int(text)
-
-
-def _metres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 10:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length in metres between 0 and 10")
-    return value
+    add_replace(parser, "SCENE")
 
 
 def _describe(arguments: argparse.Namespace) -> int:
@@ -141,10 +134,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench prepare`."""
     if arguments.init:
         if arguments.scene is not None:
-            arguments.parser.error("--init writes session.toml and makes no scene; leave SCENE out")
+            arguments.usage_error("--init writes session.toml and makes no scene; leave SCENE out")
         return _describe(arguments)
     if arguments.square_metres is not None:
-        arguments.parser.error("--square-metres goes with --init")
+        arguments.usage_error("--square-metres goes with --init")
     from splashbench.errors import SplashbenchError
     from splashbench.prepare.pipeline import Options, prepare
 

@@ -1,109 +1,99 @@
-"""The options of `splashbench run external`: a stranger's code, run by its own commands."""
+"""`splashbench run-external SCENE OUT`: reconstruct a scene with a code that runs by its own commands."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from splashbench.cli.arguments import EXPORT_FORMATS, add_points, add_run_options, add_scene
+from splashbench.cli.command import add_command
 from splashbench.cli.output import say
-from splashbench.cli.scene import add_points
+from splashbench.cli.run import report_submission
 
-if TYPE_CHECKING:
-    from splashbench.submission import Submission
+_DESCRIPTION = """\
+Export SCENE, fit it by COMMAND, and write the submission OUT. Test images are never exported.
 
-NAME = "external"
+Commands may hold {scene} the exported scene, {out} a folder for the model, {into} a folder for renders/ and alpha/,
+{views} the list of test views, {seed} {device} {frames} {seconds} {progress}; doubled braces are braces. Commands are
+recorded in the submission. docs/external_methods.md explains the placeholders.
+"""
 
-#: Options that only a code of its own has, with what they are by default.
-_OWN = {
-    "name": None,
-    "fit_command": None,
-    "trained": None,
-    "format": None,
-    "render_command": None,
-    "importer": None,
-    "shell": False,
-    "directory": None,
-    "method_version": None,
-    "mixed": False,
-    "blank_test_images": False,
-    "masks": False,
-    "points": None,
-    "work": None,
-}
+_EPILOG = """\
+examples:
+  splashbench run-external SCENE OUT --name theirs --format blender \\
+    --command "/envs/theirs/bin/python train.py -s {scene} -m {out} --seed {seed}" \\
+    --render-command "/envs/theirs/bin/python render_views.py -m {out} --views {views} --to {into}"
+  splashbench run-external SCENE OUT --name theirs --format nerfies --trained models/theirs --import deformable_3dgs
+
+A code that crashes or hangs gives a submission with that status, and exit status 1. It is a program with your rights:
+run a stranger's in a container.
+"""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to the parser of `run`."""
-    group = parser.add_argument_group(
-        "a code of its own (METHOD external)",
-        "Commands may hold {scene} the exported scene, {out} a folder for the model, {into} a folder for renders/ and\n"
-        "  alpha/, {views} the list of test views, {seed} {device} {frames} {seconds} {progress}; doubled braces are\n"
-        "  braces. They are recorded in the submission. docs/external_methods.md has examples.",
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = add_command(
+        subparsers,
+        "run-external",
+        run,
+        summary="reconstruct a scene with a code in an environment of its own",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
     )
-    group.add_argument("--name", help="what the method is called in the submission")
-    group.add_argument(
-        "--command", dest="fit_command", metavar="COMMAND", help="fits the scene; clocked, and its memory measured"
+    add_scene(parser)
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the submission, made by the run")
+    parser.add_argument("--name", required=True, help="what the method is called in the submission")
+    parser.add_argument("--format", choices=EXPORT_FORMATS, required=True, help="layout of the exported scene")
+    model = parser.add_mutually_exclusive_group(required=True)
+    model.add_argument(
+        "--command", dest="fit_command", metavar="COMMAND", help="fits the scene; its time and memory are measured"
     )
-    group.add_argument(
+    model.add_argument(
         "--trained",
         type=Path,
         metavar="DIR",
         help="instead of --command: what it left as {out} earlier, trained on this scene as `scene export` with the "
         "same --format, --points and --blank-test-images wrote it; no fit time is recorded",
     )
-    group.add_argument("--format", choices=("nerfies", "nerfstudio", "blender", "colmap"), help="of the exported scene")
-    group.add_argument(
+    renders = parser.add_mutually_exclusive_group()
+    renders.add_argument(
         "--render-command", metavar="COMMAND", help="writes the test views into {into}, where --command does not"
     )
-    group.add_argument("--import", dest="importer", metavar="IMPORTER", help="reads {out}; a name, or FILE.py:CLASS")
-    group.add_argument("--shell", action="store_true", help="commands are for /bin/sh: pipes, variables, several lines")
-    group.add_argument("--directory", type=Path, metavar="DIR", help="where commands run (default: here)")
-    group.add_argument("--method-version", metavar="TEXT", help='of the code (default "1")')
-    group.add_argument(
+    renders.add_argument("--import", dest="importer", metavar="IMPORTER", help="reads {out}; a name, or FILE.py:CLASS")
+    parser.add_argument(
+        "--shell", action="store_true", help="commands are for /bin/sh: pipes, variables, several lines"
+    )
+    parser.add_argument(
+        "--directory", type=Path, default=Path(), metavar="DIR", help="where the commands run (default: here)"
+    )
+    parser.add_argument("--method-version", default="1", metavar="TEXT", help='version of the code (default: "1")')
+    parser.add_argument("--preset", help='name of the settings that the commands hold (default: "external")')
+    parser.add_argument(
         "--mixed",
         action="store_true",
         help="one set of primitives is background and liquid; the importers of official codes say so themselves",
     )
-    group.add_argument("--blank-test-images", action="store_true", help="black images, for codes that open them")
-    group.add_argument("--masks", action="store_true", help="export the training views' liquid masks too")
-    add_points(group, default=None)
-    group.add_argument("--work", type=Path, metavar="DIR", help="a new folder that keeps export, output and logs")
+    parser.add_argument("--blank-test-images", action="store_true", help="black images, for codes that open them")
+    parser.add_argument("--masks", action="store_true", help="export the training views' liquid masks too")
+    add_points(parser)
+    parser.add_argument("--work", type=Path, metavar="DIR", help="a new folder that keeps export, output and logs")
+    add_run_options(parser)
 
 
-def fault(arguments: argparse.Namespace) -> str | None:
+def _usage_fault(arguments: argparse.Namespace) -> str | None:
     """What is wrong with the options together, or None."""
-    if arguments.method != NAME:
-        for name, default in _OWN.items():
-            if getattr(arguments, name) != default:
-                return f"{_option(name)} is for METHOD external alone"
-        return None
-    for name in ("name", "format"):
-        if getattr(arguments, name) is None:
-            return f"METHOD external needs {_option(name)}"
-    if arguments.fit_command is None and arguments.trained is None:
-        return "METHOD external needs --command, or --trained where the model is there already"
-    if arguments.fit_command is not None and arguments.trained is not None:
-        return "--command and --trained are two ways to the same model; give one"
     if arguments.trained is not None and not (arguments.importer or arguments.render_command):
         return "--trained needs --import or --render-command: something has to read the model"
-    if arguments.overrides:
-        return "--set is for methods with settings; an external code's are in its commands"
-    if arguments.render_command and arguments.importer:
-        return "--render-command and --import are two ways to the same renders; give one"
     if not arguments.importer and (arguments.exr or arguments.timing_frames is not None):
-        return "--exr and --timing-frames are for renders of our own, of methods and of --import"
+        return "--exr and --timing-frames need --import: splashbench then renders the views itself"
     return None
 
 
-def _option(name: str) -> str:
-    named = {"importer": "--import", "fit_command": "--command"}
-    return named.get(name, "--" + name.replace("_", "-"))
-
-
-def run(arguments: argparse.Namespace) -> Submission:
-    """Run the code that the options tell of."""
-    from splashbench.cli.scene import POINTS
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench run-external`."""
+    fault = _usage_fault(arguments)
+    if fault:
+        arguments.usage_error(fault)
     from splashbench.harness.external.runner import ExternalCode, run_external
     from splashbench.harness.runner import TIMING_FRAMES
     from splashbench.observe import initial_points
@@ -118,17 +108,17 @@ def run(arguments: argparse.Namespace) -> Submission:
         command=arguments.fit_command or "",
         trained=arguments.trained,
         format=arguments.format,
-        version=arguments.method_version or "1",
+        version=arguments.method_version,
         mixed=arguments.mixed,
         render_command=arguments.render_command,
         importer=arguments.importer,
         shell=arguments.shell,
-        directory=arguments.directory or Path(),
+        directory=arguments.directory,
         blank_test_images=arguments.blank_test_images,
         masks=arguments.masks,
-        points=POINTS if arguments.points is None else arguments.points,
+        points=arguments.points,
     )
-    return run_external(
+    submission = run_external(
         code,
         arguments.scene,
         arguments.out,
@@ -143,3 +133,4 @@ def run(arguments: argparse.Namespace) -> Submission:
         keep_model=not arguments.no_model,
         work=arguments.work,
     )
+    return report_submission(submission, arguments)

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splashbench.cli.output import add_json, emit, say, table
+from splashbench.cli.arguments import add_lpips_weights, add_settings
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say, table
 
 if TYPE_CHECKING:
     from splashbench.score import Protocol, Result
@@ -29,29 +31,21 @@ _SHOWN = ("psnr", "dpsnr_bg", "ssim", "lpips", "miou", "spill", "jitter_error", 
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "score",
-        help="score submissions by protocol v1",
+        run,
+        summary="score submissions by protocol v1",
         description="Score each SUBMISSION against SCENE and write one result (JSON) for each into DIR.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("submissions", nargs="+", type=Path, metavar="SUBMISSION", help="folder of a submission")
     parser.add_argument("--scene", type=Path, required=True, help="folder of the scene the submissions are of")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder the results are written into")
     parser.add_argument("--reference", type=Path, metavar="SUBMISSION", help="the control `nothing` on this scene")
-    parser.add_argument("--lpips-weights", type=Path, metavar="FILE", help=".npz of LPIPS weights (AlexNet, v0.1)")
+    add_lpips_weights(parser)
     parser.add_argument("--sheet", type=Path, metavar="PNG", help="also draw a contact sheet of all submissions")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="changes",
-        help="change a setting of the protocol; such results are kept apart from v1's",
-    )
-    add_json(parser)
-    parser.set_defaults(handler=run)
+    add_settings(parser, "change a setting of the protocol; such results are kept apart from v1's", dest="changes")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`splashbench study ablate SPEC OUT`: a table of runs, what each part of a method or each doubtful input is worth."""
+"""`splashbench study run SPEC OUT`: a table of runs that shows what a part of a method or of its input is worth."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import argparse
 import shlex
 from pathlib import Path
 
-from splashbench.cli.output import add_json, emit, say
+from splashbench.cli.arguments import add_lpips_weights, add_settings, whole_number
+from splashbench.cli.command import add_command, add_group
+from splashbench.cli.output import emit, say
 
 _EPILOG = """\
 examples:
-  splashbench study ablate ablation OUT --scenes scenes/bowl_001 scenes/bowl_002
-  splashbench study ablate masks OUT --scenes SCENE --seeds 0 1 2 --set iterations=300
-  splashbench study ablate my_study.toml OUT --jobs 2
-  splashbench study ablate ablation OUT --scenes SCENE --only per_frame      one row; the others stay as they are
+  splashbench study run ablation OUT --scenes scenes/bowl_001 scenes/bowl_002
+  splashbench study run masks OUT --scenes SCENE --seeds 0 1 2 --set iterations=300
+  splashbench study run my_study.toml OUT --jobs 2
+  splashbench study run ablation OUT --scenes SCENE --only per_frame      one row; the others stay as they are
 
 SPEC is a TOML file, or one of: ablation, baselines, best, interpolation, masks, sensitivity, views
 (docs/study.md). OUT gets table.md, table.csv, runs.csv, table.json, chart.png and chart.svg. The same command again
@@ -23,60 +25,39 @@ goes on where it stopped. Failed runs are rows.
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
-    parser = subparsers.add_parser(
+    actions = add_group(
+        subparsers,
         "study",
-        help="many runs in one table: ablations, worse masks, fewer views",
+        summary="many runs in one table: ablations, worse masks, fewer views",
         description="Run variants of a method on several scenes and seeds, and tabulate them.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    actions = parser.add_subparsers(dest="action", metavar="ablate", required=True)
-    ablate = actions.add_parser(
-        "ablate",
-        help="run, score and tabulate variants",
+    parser = add_command(
+        actions,
+        "run",
+        run,
+        summary="run, score and tabulate variants",
         description="Run every variant of SPEC on every scene with every seed, score the runs, and tabulate them.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    ablate.add_argument("spec", metavar="SPEC", help="a TOML file, or the name of a study that is shipped")
-    ablate.add_argument("out", type=Path, metavar="OUT", help="folder of the study; runs that are in it are kept")
-    ablate.add_argument(
+    parser.add_argument("spec", metavar="SPEC", help="a TOML file, or the name of a study that is shipped")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; runs that are in it are kept")
+    parser.add_argument(
         "--scenes", nargs="+", action="extend", default=[], metavar="SCENE", help="folders of scenes, for the spec's"
     )
-    ablate.add_argument(
-        "--seeds", nargs="+", action="extend", type=_not_negative, default=[], metavar="SEED", help="for the spec's"
+    parser.add_argument(
+        "--seeds", nargs="+", action="extend", type=whole_number(0), default=[], metavar="SEED", help="for the spec's"
     )
-    ablate.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="base",
-        help="a setting of every row, as the budget of iterations is; on top of the spec's",
-    )
-    ablate.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
-    ablate.add_argument("--jobs", type=_positive, default=1, metavar="N", help="runs at once (default 1)")
-    ablate.add_argument("--retry", action="store_true", help="run again what failed")
-    ablate.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
-    ablate.add_argument("--lpips-weights", type=Path, metavar="FILE", help=".npz of LPIPS weights (AlexNet, v0.1)")
-    add_json(ablate)
-    ablate.set_defaults(handler=run)
-
-
-def _not_negative(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
-    return int(text)
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
-    return int(text)
+    add_settings(parser, "a setting of every row, such as the number of iterations; overrides the spec's", dest="base")
+    parser.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
+    parser.add_argument("--jobs", type=whole_number(1), default=1, metavar="N", help="runs at once (default 1)")
+    parser.add_argument("--retry", action="store_true", help="run again what failed")
+    parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
+    add_lpips_weights(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Handle `splashbench study ablate`."""
+    """Handle `splashbench study run`."""
     from splashbench.harness.runner import parse_overrides
     from splashbench.study.execution import ExecutionOptions, carry_out_plan
     from splashbench.study.job import Store
@@ -118,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _command(arguments: argparse.Namespace) -> str:
     """The command that makes this table from nothing."""
-    words = ["splashbench", "study", "ablate", arguments.spec, str(arguments.out)]
+    words = ["splashbench", "study", "run", arguments.spec, str(arguments.out)]
     for flag, values in (("--scenes", arguments.scenes), ("--seeds", arguments.seeds)):
         words += [flag, *map(str, values)] if values else []
     for pair in arguments.base:

@@ -69,7 +69,7 @@ def run_method(
         raise SplashbenchError(f"{scene_directory} has {scene.n_frames} timesteps; to withhold some takes three")
     if name == EXTERNAL:
         raise SplashbenchError(
-            "`external` is run by commands: splashbench run external SCENE OUT --name ... --command ..."
+            "`external` is run by commands: splashbench run-external SCENE OUT --name ... --command ..."
         )
     if name == ORACLE:
         if preset or overrides or withheld:

@@ -1,4 +1,4 @@
-"""`splashbench scene container`: the container's surface from the views themselves, where nobody scanned it."""
+"""`splashbench scene reconstruct-container`: the container's surface from the views, where nobody scanned it."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def textured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def done(textured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The textured scene with its container; read-only."""
     folder = Path(shutil.copytree(textured, tmp_path_factory.mktemp("done") / "bowl"))
-    assert main(["scene", "container", str(folder)]) == 0
+    assert main(["scene", "reconstruct-container", str(folder)]) == 0
     return folder
 
 
@@ -84,14 +84,14 @@ def scene(textured: Path, tmp_path: Path) -> Path:
 
 def reconstruct(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
     capsys.readouterr()
-    assert main(["scene", "container", *map(str, words), "--json"]) == 0
+    assert main(["scene", "reconstruct-container", *map(str, words), "--json"]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
-    assert main(["scene", "container", *map(str, words)]) == 1
+    assert main(["scene", "reconstruct-container", *map(str, words)]) == 1
     said = capsys.readouterr().err.splitlines()
     said = [line for line in said if not line.startswith("reconstructing")]
     assert len(said) == 1
@@ -159,7 +159,7 @@ def test_a_released_scene_stays_one(scene: Path, tmp_path: Path, capsys: pytest.
     (released / "scene.json").unlink()
     assert Scene.open(released).is_released
     capsys.readouterr()
-    assert main(["scene", "container", str(released)]) == 0
+    assert main(["scene", "reconstruct-container", str(released)]) == 0
     assert "taken to be opaque" in capsys.readouterr().err
     assert Scene.open(released).is_released
 

@@ -1,4 +1,4 @@
-"""`splashbench scene place`: the scanned container put into a scene that says nothing of it, as the released ones."""
+"""`splashbench scene place-container`: the scanned container put into a scene that says nothing of it."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def scan(tmp_path: Path) -> Path:
 
 def place(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
     capsys.readouterr()
-    assert main(["scene", "place", *map(str, words), "--json"]) == 0
+    assert main(["scene", "place-container", *map(str, words), "--json"]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
-    assert main(["scene", "place", *map(str, words)]) == 1
+    assert main(["scene", "place-container", *map(str, words)]) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("placing")]
     assert len(said) == 1
     return said[0]

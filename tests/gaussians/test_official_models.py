@@ -468,7 +468,7 @@ def _checked_and_scored(
 ) -> tuple[Path, dict[str, float]]:
     """A code that leaves `folder`/trained, through run, check and score: the submission, and its figures."""
     out = folder / "submission"
-    arguments = ["run", "external", str(scene.directory), str(out), "--name", "theirs", *options]
+    arguments = ["run-external", str(scene.directory), str(out), "--name", "theirs", *options]
     arguments += ["--command", _leaves(folder / "trained"), "--points", str(POINTS), "--timing-frames", "1", "--json"]
     assert main(arguments) == 0
     assert json.loads(capsys.readouterr().out)["status"] == "ok"
@@ -524,7 +524,7 @@ def test_a_model_that_was_trained_before_is_imported_without_a_command(
     submissions = []
     for name, how in (("run", ["--command", command]), ("taken", ["--trained", str(tmp_path / "trained")])):
         out = tmp_path / name
-        assert main(["run", "external", str(balls.directory), str(out), *common, *how, "--timing-frames", "1"]) == 0
+        assert main(["run-external", str(balls.directory), str(out), *common, *how, "--timing-frames", "1"]) == 0
         submissions.append(Submission.open(out))
     run, taken = submissions
     for path in sorted((tmp_path / "run" / "renders").rglob("*.png")):
@@ -538,7 +538,7 @@ def test_a_model_that_was_trained_before_is_imported_without_a_command(
     capsys.readouterr()
     for how, said in ((tmp_path / "none", "is not a folder; give the one that the code left its model in"),
                       (tmp_path / "balls", "let the code save its last iteration")):  # fmt: skip
-        assert main(["run", "external", str(balls.directory), str(tmp_path / "x"), *common, "--trained", str(how)]) == 1
+        assert main(["run-external", str(balls.directory), str(tmp_path / "x"), *common, "--trained", str(how)]) == 1
         assert said in capsys.readouterr().err
 
 

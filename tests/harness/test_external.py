@@ -61,7 +61,7 @@ def test_a_good_code_is_measured_checked_and_scored(
     balls_directory: Path, balls: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    arguments = ["run", "external", str(balls_directory), str(out), "--name", "theirs", "--format", "blender"]
+    arguments = ["run-external", str(balls_directory), str(out), "--name", "theirs", "--format", "blender"]
     arguments += ["--command", _fit("good", "{seed}", "{device}", "{frames}", "{seconds}", "a b"), "--mixed", "--json"]
     arguments += ["--render-command", _render("good"), "--seed", "4", "--device", "cuda:1", "--points", str(POINTS)]
     assert main(arguments) == 0
@@ -164,7 +164,7 @@ def test_what_is_handed_in_is_not_trusted(
 def test_a_failure_is_exit_1_and_keeps_the_last_lines(
     balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["run", "external", str(balls_directory), str(tmp_path / "out"), "--name", "theirs"]
+    arguments = ["run-external", str(balls_directory), str(tmp_path / "out"), "--name", "theirs"]
     assert main([*arguments, "--format", "blender", "--command", _fit("crash"), "--points", "0"]) == 1
     note, error = capsys.readouterr().err.splitlines()
     assert note.startswith("note: principal points lie up to 2.7 pixels off the middle")
@@ -222,7 +222,7 @@ def test_a_run_that_is_stopped_ends_everything_and_leaves_nothing(
 ) -> None:
     place = tmp_path / "place"
     place.mkdir()
-    arguments = [sys.executable, "-m", "splashbench", "run", "external", str(balls_directory), str(place / "out")]
+    arguments = [sys.executable, "-m", "splashbench", "run-external", str(balls_directory), str(place / "out")]
     arguments += ["--name", "theirs", "--format", "blender", "--points", "0"]
     arguments += ["--command", _fit("hang", tmp_path / "ids")]
     scratch = tmp_path / "scratch"
@@ -245,7 +245,7 @@ def test_a_run_that_is_stopped_ends_everything_and_leaves_nothing(
 
 
 def test_a_code_does_not_outlive_a_harness_that_is_killed(balls_directory: Path, tmp_path: Path) -> None:
-    arguments = [sys.executable, "-m", "splashbench", "run", "external", str(balls_directory), str(tmp_path / "out")]
+    arguments = [sys.executable, "-m", "splashbench", "run-external", str(balls_directory), str(tmp_path / "out")]
     arguments += ["--name", "theirs", "--format", "blender", "--points", "0"]
     arguments += ["--command", _fit("hang", tmp_path / "ids")]
     process = subprocess.Popen(arguments, env={**os.environ, "TMPDIR": str(tmp_path)})
@@ -362,29 +362,28 @@ def test_what_cannot_run_is_told_before_anything_does(
     assert list(tmp_path.iterdir()) == []
 
 
+NAMED = ["--name", "theirs", "--format", "colmap"]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["external", "--command", "true", "--format", "colmap"], "METHOD external needs --name"),
-        (["external", "--name", "theirs", "--format", "colmap"], "METHOD external needs --command"),
-        (["external", "--name", "theirs", "--command", "true"], "METHOD external needs --format"),
-        (
-            ["external", "--name", "a", "--format", "colmap", "--trained", "b", "--command", "c"],
-            "are two ways to the same",
-        ),
-        (["external", "--name", "a", "--format", "colmap", "--trained", "b"], "--trained needs --import"),
-        (["nothing", "--trained", "x"], "--trained is for METHOD external alone"),
-        (["nothing", "--command", "true"], "--command is for METHOD external alone"),
-        (["nothing", "--points", "3"], "--points is for METHOD external alone"),
-        (["external", "--name", "a", "--command", "b", "--format", "colmap", "--set", "a=1"], "--set is for methods"),
-        (["external", "--name", "a", "--command", "b", "--format", "colmap", "--exr"], "--exr and --timing-frames"),
-        (["external", "--name", "a", "--command", "b", "--format", "colmap", "--with-test-images"], "unrecognized"),
+        (["--command", "true", "--format", "colmap"], "the following arguments are required: --name"),
+        (["--name", "theirs", "--format", "colmap"], "one of the arguments --command --trained is required"),
+        (["--name", "theirs", "--command", "true"], "the following arguments are required: --format"),
+        ([*NAMED, "--trained", "b", "--command", "c"], "--command: not allowed with argument --trained"),
+        ([*NAMED, "--trained", "b"], "--trained needs --import or --render-command"),
+        ([*NAMED, "--command", "b", "--render-command", "c", "--import", "d"], "--import: not allowed with argument"),
+        ([*NAMED, "--command", "b", "--exr"], "--exr and --timing-frames need --import"),
+        ([*NAMED, "--command", "b", "--timing-frames", "9"], "--exr and --timing-frames need --import"),
+        ([*NAMED, "--command", "b", "--set", "a=1"], "unrecognized arguments: --set"),
+        ([*NAMED, "--command", "b", "--with-test-images"], "unrecognized arguments: --with-test-images"),
     ],
 )
 def test_options_that_do_not_go_together_are_wrong_usage(
     options: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        main(["run", options[0], "scene", "out", *options[1:]])
+        main(["run-external", "scene", "out", *options])
     assert stop.value.code == 2
     assert message in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`splashbench study ablate`: runs are made once, survive a kill, fail as rows, and bad input is one line."""
+"""`splashbench study run`: runs are made once, survive a kill, fail as rows, and bad input is one line."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def study(balls_directory: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
         ],
     )
     path = _write(place, spec)
-    assert main(["study", "ablate", path, str(place / "out")]) == 0
+    assert main(["study", "run", path, str(place / "out")]) == 0
     return path, place / "out", log
 
 
@@ -120,7 +120,7 @@ def test_a_shared_part_counts_in_every_fit_time(study: tuple[str, Path, Path]) -
 def test_the_same_command_again_runs_nothing(study: tuple[str, Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     path, out, log = study
     before, fits = (out / "table.csv").read_bytes(), len(_fits(log))
-    assert main(["study", "ablate", path, str(out), "--json"]) == 0
+    assert main(["study", "run", path, str(out), "--json"]) == 0
     said = capsys.readouterr()
     assert len(_fits(log)) == fits
     assert (out / "table.csv").read_bytes() == before
@@ -132,7 +132,7 @@ def test_the_same_command_again_runs_nothing(study: tuple[str, Path, Path], caps
 def test_what_failed_is_tried_again_on_request(study: tuple[str, Path, Path]) -> None:
     path, out, log = study
     fits = len(_fits(log))
-    assert main(["study", "ablate", path, str(out), "--retry"]) == 0
+    assert main(["study", "run", path, str(out), "--retry"]) == 0
     assert _fits(log)[fits:] == ["0.5 1"]
 
 
@@ -140,7 +140,7 @@ def test_one_row_can_be_run_by_itself_and_several_runs_at_once(
     balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = _write(tmp_path, _spec(balls_directory)), tmp_path / "out"
-    assert main(["study", "ablate", path, str(out), "--only", "dark", "--jobs", "2", "--keep"]) == 0
+    assert main(["study", "run", path, str(out), "--only", "dark", "--jobs", "2", "--keep"]) == 0
     assert "run 2 of 2" in capsys.readouterr().err
     rows = {row["variant"]: row for row in _table(out)["rows"]}
     assert (rows["full"]["not_run"], rows["dark"]["ok"]) == (2, 2)
@@ -156,7 +156,7 @@ def test_dpsnr_is_measured_against_nothing_on_the_same_scene(balls_directory: Pa
         "variants": [{"name": "full"}],
     }
     path, out = _write(tmp_path, _spec(balls_directory, **changes)), tmp_path / "out"
-    assert main(["study", "ablate", path, str(out)]) == 0
+    assert main(["study", "run", path, str(out)]) == 0
     full, nothing = _table(out)["rows"]
     assert (nothing["variant"], nothing["control"], nothing["ok"]) == ("nothing", True, 1)
     gain = full["figures"]["psnr"]["mean"] - nothing["figures"]["psnr"]["mean"]
@@ -172,16 +172,16 @@ def test_a_killed_study_loses_the_run_in_progress_only(balls_directory: Path, tm
         "variants": [{"name": "full"}, {"name": "slow", "settings": {"shared_seconds": 600.0, "grey": 0.2}}],
     }
     path, out = _write(tmp_path, _spec(balls_directory, **changes)), tmp_path / "out"
-    command = [sys.executable, "-m", "splashbench", "study", "ablate", path, str(out)]
+    command = [sys.executable, "-m", "splashbench", "study", "run", path, str(out)]
     mark = uuid.uuid4().hex  # every process that the study starts inherits it
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "SPLASHBENCH_TEST_MARK": mark})
     _wait_for(lambda: "0.2 0" in _fits(log))
     with pytest.raises(SplashbenchError, match="another study is running in"):
-        _raising(["study", "ablate", path, str(out)])
+        _raising(["study", "run", path, str(out)])
     process.send_signal(signal.SIGKILL)
     process.wait()
     _wait_for(lambda: not any(mark.encode() in _environment(entry) for entry in Path("/proc").iterdir()))
-    assert main(["study", "ablate", path, str(out), "--only", "full"]) == 0
+    assert main(["study", "run", path, str(out), "--only", "full"]) == 0
     assert _fits(log) == ["0.5 0", "0.2 0"]
     rows = {row["variant"]: row for row in _table(out)["rows"]}
     assert (rows["full"]["ok"], rows["slow"]["not_run"]) == (1, 1)
@@ -243,7 +243,7 @@ def test_bad_input_is_one_line_before_anything_runs(
     said: str,
 ) -> None:
     path = _write(tmp_path, _spec(balls_directory, **changes))
-    assert main(["study", "ablate", path, str(tmp_path / "out"), *words]) == 1
+    assert main(["study", "run", path, str(tmp_path / "out"), *words]) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert error.count("\n") == 1
@@ -256,7 +256,7 @@ def test_a_folder_with_other_files_is_left_alone(balls_directory: Path, tmp_path
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
     with pytest.raises(SplashbenchError, match="holds files that are no study's"):
-        _raising(["study", "ablate", path, str(tmp_path / "mine")])
+        _raising(["study", "run", path, str(tmp_path / "mine")])
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
@@ -267,7 +267,7 @@ def test_an_unknown_study_is_told_with_those_there_are() -> None:
 
 def test_help_names_every_study_that_is_shipped(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["study", "ablate", "--help"])
+        main(["study", "run", "--help"])
     assert f"one of: {', '.join(shipped())}" in " ".join(capsys.readouterr().out.split())
 
 
@@ -279,7 +279,7 @@ def test_a_row_may_be_of_another_method(balls_directory: Path, tmp_path: Path) -
         variants=[{"name": "full"}, {"name": "photograph", "method": "nearest_camera"}],
     )
     out = tmp_path / "out"
-    assert main(["study", "ablate", _write(tmp_path, spec), str(out)]) == 0
+    assert main(["study", "run", _write(tmp_path, spec), str(out)]) == 0
     rows = {row["variant"]: row for row in _table(out)["rows"]}
     assert rows["photograph"]["figures"]["psnr"]["mean"] != rows["full"]["figures"]["psnr"]["mean"]
     results = {source.result.method: source.result for source in load_results(out / "results")}

@@ -23,7 +23,7 @@ from splashbench.submission import Record
 from splashbench.synth.balls import write_balls_scene
 
 METHOD = f"{Path(__file__).with_name('study_methods.py')}:Grey"
-COMMAND = "splashbench study ablate greys.toml out"
+COMMAND = "splashbench study run greys.toml out"
 # PSNR by variant, scene and seed; a crash is None.
 PSNR: dict[str, dict[str, list[float | None]]] = {
     "full": {"a": [20.0, 21.0, 22.0], "b": [30.0, 31.0, 32.0]},

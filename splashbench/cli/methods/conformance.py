@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splashbench.cli.output import add_json, emit, say
-from splashbench.cli.run import seconds_above_zero
+from splashbench.cli.arguments import add_device, add_method, add_settings, add_timeout
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say
 
 if TYPE_CHECKING:
     from splashbench.harness.conformance import Finding
@@ -27,24 +28,21 @@ It finds mistakes, not malice: a method is a program with your rights; run a str
 
 def register(actions: argparse._SubParsersAction) -> None:
     """Add the action to those of `splashbench methods`."""
-    parser = actions.add_parser(
+    parser = add_command(
+        actions,
         "test",
-        help="does a method keep the contract?",
+        run,
+        summary="test whether a method keeps the contract",
         description="Test whether METHOD keeps the contract of CONTRIBUTING.md. Exit status 1 where a check fails.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("method", help="a name from `splashbench methods list`, or FILE.py:CLASS")
-    parser.add_argument("--scene", type=Path, help="test on a copy of this scene (default: a small made-up one)")
+    add_method(parser)
+    parser.add_argument("--scene", type=Path, help="test on a copy of this scene (default: a small synthetic one)")
     parser.add_argument("--preset", help="default: `quick` where the method has it, else its first one")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
-    parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can")
-    parser.add_argument("--only", nargs="+", action="extend", metavar="CHECK", help="make these checks alone")
-    parser.add_argument(
-        "--timeout", type=seconds_above_zero, metavar="SECONDS", help="limit of each single step (default 600)"
-    )
-    add_json(parser)
-    parser.set_defaults(handler=run)
+    add_settings(parser, "a single setting on top of the preset; may be given several times")
+    add_device(parser)
+    parser.add_argument("--only", nargs="+", action="extend", metavar="CHECK", help="run these checks alone")
+    add_timeout(parser, "limit of each single step (default: 600)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"{report.method}: keeps the contract, preset {report.preset}; {report.seconds:.0f} s")
         return 0
     count = sum(finding.verdict.value == "failed" for finding in report.findings)
-    say(f"error: {report.method}: {count} of {len(report.findings)} checks failed; mend the first one first")
+    say(f"error: {report.method}: {count} of {len(report.findings)} checks failed; fix the first one first")
     return 1
 
 

@@ -1,4 +1,4 @@
-"""`splashbench scene place`: say in a scene's scene.json where its scanned container stands."""
+"""`splashbench scene place-container`: say in a scene's scene.json where its scanned container stands."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splashbench.cli.output import add_json, emit, say
+from splashbench.cli.arguments import add_container_masks, add_replace, add_scene, positive_number
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say
 
 if TYPE_CHECKING:
     from splashbench.container.released_scene import ReleasedPlacement
@@ -18,37 +20,40 @@ _TILT_DEGREES, _SCALE = 3.0, 1.05
 
 _EPILOG = """\
 examples:
-  splashbench scene place data/real_scene/bowl_001 data/meshes/bowl_001.glb --picture bowl_001.png
-  splashbench scene place data/real_scene_crop/bowl_001 data/meshes/bowl_001.glb --masks data/real_scene/bowl_001
+  splashbench scene place-container real_scene/bowl_001 meshes/bowl_001.glb --picture bowl_001.png
+  splashbench scene place-container real_scene_crop/bowl_001 meshes/bowl_001.glb --masks real_scene/bowl_001
 
-The masks in container_mask/ of the training cameras place the mesh, those of the test cameras verify it. MESH is copied
-into the scene, and scene.json says where it stands, what is down (a container stands upright; its mesh has to be level
-in its own coordinates) and how long a scene unit is (a scan is in metres), unless it said so before. splashsplat uses
-all three. The scene is another one for the scorer then: run methods again.
+The masks in container_mask/ of the training cameras place the mesh; those of the test cameras verify it. MESH is copied
+into SCENE. scene.json then says where it stands, which way is down and how long a scene unit is; what it said of these
+before stays. That takes a mesh that stands level in its own coordinates and has a known unit (a scan is in metres).
+splashsplat uses all three. SCENE has another digest then: run methods again.
 """
 
 
 def register(actions: argparse._SubParsersAction) -> None:
     """Add the action to those of `splashbench scene`."""
-    action = actions.add_parser(
-        "place",
-        help="find where its scanned container stands, for scene.json",
+    action = add_command(
+        actions,
+        "place-container",
+        place_container,
+        summary="find where its scanned container stands, for scene.json",
         description="Place the mesh of the container in SCENE by its container masks, and write that to scene.json.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    action.add_argument("scene", type=Path, help="folder of the scene")
-    action.add_argument("mesh", type=Path, help="the container's mesh: .glb, .ply or .obj")
-    action.add_argument(
-        "--masks", type=Path, metavar="SCENE", help="the scene before it was cropped, which has the container masks"
-    )
+    add_scene(action)
+    action.add_argument("mesh", type=Path, metavar="MESH", help="the container's mesh: .glb, .ply or .obj")
+    add_container_masks(action)
     action.add_argument(
         "--up",
         choices=("x", "-x", "y", "-y", "z", "-z"),
         help="the mesh's direction that points up (default: what fits; y where several do)",
     )
     action.add_argument(
-        "--metres-per-unit", type=_positive, default=1.0, metavar="M", help="length of the mesh's unit (default 1)"
+        "--metres-per-unit",
+        type=positive_number("metres"),
+        default=1.0,
+        metavar="M",
+        help="length of the mesh's unit (default: 1)",
     )
     action.add_argument(
         "--transparent",
@@ -57,23 +62,11 @@ def register(actions: argparse._SubParsersAction) -> None:
         help="whether the liquid is seen through the container's walls (default: as scene.json says; else not)",
     )
     action.add_argument("--picture", type=Path, metavar="PNG", help="draw the placed outline over every camera's image")
-    action.add_argument("--replace", action="store_true", help="replace container, gravity and scale in scene.json")
-    add_json(action)
-    action.set_defaults(handler=place)
+    add_replace(action, "container, gravity and scale in scene.json")
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no length")
-    return value
-
-
-def place(arguments: argparse.Namespace) -> int:
-    """Handle `splashbench scene place`."""
+def place_container(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench scene place-container`."""
     from splashbench.container.entry import doubtful, picture, require_picture
     from splashbench.container.released_scene import place_in_scene, require_container_place, write_placement
     from splashbench.files import write_png

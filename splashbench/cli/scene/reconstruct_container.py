@@ -1,50 +1,49 @@
-"""`splashbench scene container`: reconstruct a container that nobody scanned from the scene's own footage."""
+"""`splashbench scene reconstruct-container`: a container that nobody scanned, from the scene's own footage."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from splashbench.cli.output import add_json, emit, say
+from splashbench.cli.arguments import add_container_masks, add_replace, add_scene
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say
 
 _EPILOG = """\
 examples:
-  splashbench scene container data/real_scene/bowl_001 --picture bowl_001.png
-  splashbench scene container data/real_scene_crop/bowl_001 --masks data/real_scene/bowl_001
+  splashbench scene reconstruct-container real_scene/bowl_001 --picture bowl_001.png
+  splashbench scene reconstruct-container real_scene_crop/bowl_001 --masks real_scene/bowl_001
 
-For an opaque container without a scan (with one: `splashbench scene place`). How deep its surface lies in the training
-views is found by plane sweep on what stands still, within container_mask/ of the training cameras; the masks of the
-test cameras verify it. It needs texture, and views that overlap. splashsplat then knows what the container hides.
-Gravity and metric scale stay as they are. The scene is another one for the scorer then: run methods again.
+For an opaque container without a scan (with one: `splashbench scene place-container`). A plane sweep over what stands
+still finds the surface, within container_mask/ of the training cameras. The masks of the test cameras verify it. The
+container needs texture, and views that overlap. splashsplat then knows what the container hides. Gravity and metric
+scale stay as they are. SCENE has another digest then: run methods again.
 """
 
 
 def register(actions: argparse._SubParsersAction) -> None:
     """Add the action to those of `splashbench scene`."""
-    action = actions.add_parser(
-        "container",
-        help="reconstruct its container from the footage, where there is no scan",
+    action = add_command(
+        actions,
+        "reconstruct-container",
+        reconstruct_container,
+        summary="reconstruct its container from the footage, where there is no scan",
         description="Reconstruct the opaque container in SCENE from its training views, and name it in scene.json.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    action.add_argument("scene", type=Path, help="folder of the scene")
-    action.add_argument(
-        "--masks", type=Path, metavar="SCENE", help="the scene before it was cropped, which has the container masks"
-    )
+    add_scene(action)
+    add_container_masks(action)
     action.add_argument(
         "--picture",
         type=Path,
         metavar="PNG",
         help="draw every camera's image with its outline, its surface beside",
     )
-    action.add_argument("--replace", action="store_true", help="replace the container that scene.json names")
-    add_json(action)
-    action.set_defaults(handler=reconstruct)
+    add_replace(action, "the container that scene.json names")
 
 
-def reconstruct(arguments: argparse.Namespace) -> int:
-    """Handle `splashbench scene container`."""
+def reconstruct_container(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench scene reconstruct-container`."""
     from splashbench.container.entry import doubtful, require_picture, require_place
     from splashbench.container.reconstruction import container_from_footage, picture, write_reconstruction
     from splashbench.errors import SplashbenchError
@@ -55,7 +54,7 @@ def reconstruct(arguments: argparse.Namespace) -> int:
     if scene.container_transparent:
         raise SplashbenchError(
             f"{scene.directory / 'scene.json'}: the container is transparent; it hides nothing, and its depth cannot be"
-            " seen; place a scan (`splashbench scene place`)"
+            " seen; place a scan (`splashbench scene place-container`)"
         )
     require_place(scene, arguments.replace)
     require_picture(arguments.picture)

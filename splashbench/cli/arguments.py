@@ -1,0 +1,129 @@
+"""Command-line validators, and the options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+#: Layouts that `splashbench.scene.export` writes, repeated here so that `--help` need not import it.
+EXPORT_FORMATS = ("nerfies", "nerfstudio", "blender", "colmap")
+#: Initial points of the liquid in each timestep of an export.
+DEFAULT_POINTS = 2000
+_MAX_IMAGE_SIDE = 8192
+
+
+def whole_number(least: int, greatest: int | None = None) -> Callable[[str], int]:
+    """A validator of whole numbers from `least` to `greatest` (inclusive; None: no limit)."""
+    limits = f"of {least} or more" if greatest is None else f"from {least} to {greatest}"
+
+    def parse(text: str) -> int:
+        if not text.isdecimal() or int(text) < least or (greatest is not None and int(text) > greatest):
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number {limits}")
+        return int(text)
+
+    return parse
+
+
+def positive_number(unit: str, below: float = math.inf) -> Callable[[str], float]:
+    """A validator of finite numbers above 0 and below `below`; `unit` is named in its message."""
+    limits = "above 0" if below == math.inf else f"between 0 and {below:g}"
+
+    def parse(text: str) -> float:
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not 0 < number < below:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number of {unit} {limits}")
+        return number
+
+    return parse
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """(width, height) in pixels from a text such as `480x270`."""
+    width, separator, height = text.lower().partition("x")
+    if not (separator and width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; write it like 480x270")
+    if not (0 < int(width) <= _MAX_IMAGE_SIDE and 0 < int(height) <= _MAX_IMAGE_SIDE):
+        raise argparse.ArgumentTypeError(f"{text!r} is out of range; give 1x1 to {_MAX_IMAGE_SIDE}x{_MAX_IMAGE_SIDE}")
+    return int(width), int(height)
+
+
+def add_scene(parser: argparse._ActionsContainer) -> None:
+    """Add the positional SCENE."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder of the scene")
+
+
+def add_method(parser: argparse._ActionsContainer, also: str = "") -> None:
+    """Add the positional METHOD; `also` names what else the command takes for one."""
+    parser.add_argument(
+        "method", metavar="METHOD", help=f"a name from `splashbench methods list`,{also} or FILE.py:CLASS"
+    )
+
+
+def add_settings(parser: argparse._ActionsContainer, help: str, dest: str = "overrides") -> None:
+    """Add `--set KEY=VALUE`, which may be given several times."""
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest=dest, help=help)
+
+
+def add_seed(parser: argparse._ActionsContainer, help: str = "seed of every random choice") -> None:
+    """Add `--seed`, 0 by default."""
+    parser.add_argument("--seed", type=whole_number(0), default=0, help=f"{help} (default: 0)")
+
+
+def add_device(parser: argparse._ActionsContainer) -> None:
+    """Add `--device`."""
+    parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can use it")
+
+
+def add_timeout(parser: argparse._ActionsContainer, help: str) -> None:
+    """Add `--timeout SECONDS`."""
+    parser.add_argument("--timeout", type=positive_number("seconds"), metavar="SECONDS", help=help)
+
+
+def add_replace(parser: argparse._ActionsContainer, output: str = "OUT") -> None:
+    """Add `--replace`; `output` names what it replaces."""
+    parser.add_argument("--replace", action="store_true", help=f"replace {output} where it exists")
+
+
+def add_points(parser: argparse._ActionsContainer) -> None:
+    """Add `--points`, the number of initial points of the liquid."""
+    parser.add_argument(
+        "--points",
+        type=whole_number(0),
+        default=DEFAULT_POINTS,
+        metavar="N",
+        help="initial points of the liquid in each timestep, from the masks' visual hull "
+        f"(default: {DEFAULT_POINTS}; 0 for none)",
+    )
+
+
+def add_container_masks(parser: argparse._ActionsContainer) -> None:
+    """Add `--masks SCENE`, the scene that has the masks of the container."""
+    parser.add_argument(
+        "--masks", type=Path, metavar="SCENE", help="the scene before it was cropped, which has the container masks"
+    )
+
+
+def add_lpips_weights(parser: argparse._ActionsContainer) -> None:
+    """Add `--lpips-weights FILE`."""
+    parser.add_argument("--lpips-weights", type=Path, metavar="FILE", help=".npz of LPIPS weights (AlexNet, v0.1)")
+
+
+def add_run_options(parser: argparse._ActionsContainer) -> None:
+    """Add what `run` and `run-external` have in common."""
+    add_seed(parser)
+    add_device(parser)
+    add_timeout(parser, "limit for the fit, and again for the rendering")
+    parser.add_argument(
+        "--timing-frames",
+        type=whole_number(0),
+        metavar="N",
+        help="frames timed for FPS (default: 100; with fewer, FPS is not scored)",
+    )
+    parser.add_argument("--exr", action="store_true", help="write the renders also as OpenEXR, for compositing")
+    parser.add_argument("--no-model", action="store_true", help="do not keep the fitted model under OUT/model")
+    add_replace(parser)

@@ -1,0 +1,104 @@
+"""Where outputs go: nothing of the user's is replaced, nothing half-written is left, any name will do."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splashbench.cli.main import main
+from splashbench.files import files_together
+
+Fails = Callable[..., str]
+
+
+def test_replace_never_takes_an_input_or_a_strangers_folder(balls_copy: Path, tmp_path: Path, fails: Fails) -> None:
+    mine = tmp_path / "photos"
+    mine.mkdir()
+    (mine / "holiday.jpg").write_bytes(b"dear")
+    run = ["run", "oracle", balls_copy]
+    assert f"{balls_copy} holds the input" in fails(*run, balls_copy, "--replace")
+    assert f"{tmp_path} holds the input" in fails(*run, tmp_path, "--replace")
+    assert "it has no submission.toml" in fails(*run, mine, "--replace")
+    assert "holiday.jpg is a file" in fails(*run, mine / "holiday.jpg", "--replace")
+    assert "it has no train_meta.json" in fails("synth", "scene", "balls", mine, "--replace")
+    assert "not the demo's" in fails("demo", mine, "--fresh")
+    assert (mine / "holiday.jpg").read_bytes() == b"dear"
+    assert (balls_copy / "train_meta.json").is_file()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["balls", "photos"]
+
+
+def test_a_session_is_never_replaced_by_its_scene(session: Path, fails: Fails) -> None:
+    for place in (session, session.parent):
+        assert f"{place} holds the input" in fails("prepare", session, place, "--replace")
+    assert (session / "session.toml").is_file()
+
+
+def test_a_link_stays_and_its_target_is_replaced(balls_directory: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    for _ in range(2):
+        assert main(["run", "oracle", str(balls_directory), str(tmp_path / "link"), "--replace"]) == 0
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "target" / "submission.toml").is_file()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "target"]
+
+
+def test_a_place_that_cannot_be_is_told_before_the_work(
+    balls_directory: Path, submission: Path, results: Path, tmp_path: Path, fails: Fails
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    scored = ["score", submission, "--scene", balls_directory]
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert f"{tmp_path / 'file'} is a file" in fails(*scored, "--out", place)
+        assert f"{tmp_path / 'file'} is a file" in fails("leaderboard", results, place)
+        assert str(place) in fails("run", "oracle", balls_directory, place)
+    assert f"{submission} is a folder" in fails(*scored, "--out", tmp_path / "results", "--sheet", submission)
+    assert not (tmp_path / "results").exists()
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_read_only_folder_is_told_before_the_work(
+    balls_directory: Path,
+    submission: Path,
+    results: Path,
+    tmp_path: Path,
+    fails: Fails,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (locked := tmp_path / "locked").mkdir()
+    # Root, as which tests often run, may write everywhere.
+    monkeypatch.setattr("splashbench.files.os.access", lambda path, mode: Path(path) != locked)
+    scored = ["score", submission, "--scene", balls_directory]
+    assert f"{locked} may not be written" in fails(*scored, "--out", locked / "results")
+    assert f"{locked} may not be written" in fails("leaderboard", results, locked / "board")
+    assert f"{locked} may not be written" in fails("run", "oracle", balls_directory, locked / "out")
+    assert f"{locked} may not be written" in fails("synth", "scene", "balls", locked / "balls")
+
+
+def test_spaces_and_letters_of_any_script_in_paths(balls_directory: Path, tmp_path: Path) -> None:
+    place = tmp_path / "ü ñ 日本"
+    scene = Path(shutil.copytree(balls_directory, place / "the scene"))
+    (scene / "scene.json").unlink()  # the folder's name is the scene's
+    scene = scene.rename(place / "器 1")
+    for words in (
+        ["run", "oracle", scene, place / "o ut"],
+        ["score", place / "o ut", "--scene", scene, "--out", place / "re sults", "--sheet", place / "shéet.png"],
+        ["leaderboard", place / "re sults", place / "b oard"],
+        ["scene", "info", scene],
+    ):
+        assert main([str(word) for word in words]) == 0
+
+
+def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("kept")
+    with pytest.raises(ValueError), files_together(tmp_path / "out") as staging:
+        (staging / "first").write_text("half")
+        raise ValueError
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine"]
+    with files_together(tmp_path / "out") as staging:
+        (staging / "first").write_text("whole")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["first", "mine"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
