@@ -8,8 +8,7 @@ from typing import Any
 
 import tomli_w
 
-from splashbench.errors import SplashbenchError
-from splashbench.files import require_plain_file
+from splashbench.files import read_document
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -20,17 +19,8 @@ _MAX_BYTES = 1 << 20
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a TOML file. Raises SplashbenchError naming the file when it is missing, too large or not TOML."""
-    path = Path(path)
-    try:
-        require_plain_file(path)
-        if path.stat().st_size > _MAX_BYTES:
-            raise SplashbenchError(f"{path} is larger than {_MAX_BYTES} bytes; this is no description file")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise SplashbenchError(f"{path} does not exist; check the path") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise SplashbenchError(f"{path} cannot be read as TOML ({error}); mend or restore it") from None
+    """Read a TOML file. Raises SplashbenchError where it is missing, too large or not TOML."""
+    return read_document(path, "TOML", tomllib.loads, _MAX_BYTES)
 
 
 def dumps(data: dict[str, Any]) -> str:

@@ -65,7 +65,7 @@ def test_a_full_disk_within_an_image_writer_is_told_too(tmp_path: Path, monkeypa
         link.symlink_to("/dev/full")
         return link
 
-    monkeypatch.setattr("splashbench.files._sibling", full)
+    monkeypatch.setattr("splashbench.files.atomic._sibling", full)
     noise = np.random.default_rng(0).integers(0, 255, (300, 300, 3), dtype=np.uint8)
     for name in ("image.jpg", "image.png"):
         with pytest.raises(DiskFullError, match=f"{name} could not be written: the disk is full"):
@@ -131,6 +131,6 @@ def test_a_zip_bomb_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest
     path = tmp_path / "bomb.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.npy", b"\0" * 1_000_000)
-    monkeypatch.setattr("splashbench.files.MAX_NPZ_BYTES", 1000)
+    monkeypatch.setattr("splashbench.files.arrays.MAX_NPZ_BYTES", 1000)
     with pytest.raises(SplashbenchError, match="unpacks to more than"):
         read_npz(path, {"a": 1})

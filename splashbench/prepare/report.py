@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.files import jpeg_bytes
 from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
 from splashbench.prepare.masks.sheet import fault_note, mask_sheet, sheet_times
 
@@ -382,8 +383,4 @@ def _figure(figure: Any) -> str:
 
 
 def _image_uri(image: NDArray[np.uint8]) -> str:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, format="JPEG", quality=88)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg_bytes(image, quality=88)).decode()}"

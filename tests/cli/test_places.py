@@ -69,7 +69,7 @@ def test_a_read_only_folder_is_told_before_the_work(
 ) -> None:
     (locked := tmp_path / "locked").mkdir()
     # Root, as which tests often run, may write everywhere.
-    monkeypatch.setattr("splashbench.files.os.access", lambda path, mode: Path(path) != locked)
+    monkeypatch.setattr("splashbench.files.places.os.access", lambda path, mode: Path(path) != locked)
     scored = ["score", submission, "--scene", balls_directory]
     assert f"{locked} may not be written" in fails(*scored, "--out", locked / "results")
     assert f"{locked} may not be written" in fails("leaderboard", results, locked / "board")

@@ -1,0 +1,69 @@
+"""Reading and writing files so that nothing is lost, half-written or trusted too far.
+
+Every output is written beside its place and renamed onto it. Every input that may come from a stranger is read with
+limits on its size, without pickles, and fails with one line that names the file.
+"""
+
+from splashbench.files.arrays import MAX_NPZ_BYTES, read_npz
+from splashbench.files.atomic import (
+    as_asked,
+    atomic_directory,
+    atomic_path,
+    files_together,
+    is_staged_for,
+    raise_if_disk_full,
+    write_text,
+)
+from splashbench.files.contents import sha256_file, tree_bytes
+from splashbench.files.documents import (
+    MAX_JSON_BYTES,
+    read_document,
+    read_json,
+    read_model,
+    validate_model,
+    write_json,
+    write_model,
+)
+from splashbench.files.images import (
+    MAX_PIXELS,
+    image_size,
+    jpeg_bytes,
+    read_gray,
+    read_image,
+    read_rgba,
+    write_image,
+    write_png,
+)
+from splashbench.files.places import require_file_place, require_folder_place, require_plain_file
+
+__all__ = [
+    "MAX_JSON_BYTES",
+    "MAX_NPZ_BYTES",
+    "MAX_PIXELS",
+    "as_asked",
+    "atomic_directory",
+    "atomic_path",
+    "files_together",
+    "image_size",
+    "is_staged_for",
+    "jpeg_bytes",
+    "raise_if_disk_full",
+    "read_document",
+    "read_gray",
+    "read_image",
+    "read_json",
+    "read_model",
+    "read_npz",
+    "read_rgba",
+    "require_file_place",
+    "require_folder_place",
+    "require_plain_file",
+    "sha256_file",
+    "tree_bytes",
+    "validate_model",
+    "write_image",
+    "write_json",
+    "write_model",
+    "write_png",
+    "write_text",
+]

@@ -1,0 +1,151 @@
+"""Writing that leaves all or nothing: every output is written beside its place and renamed onto it."""
+
+from __future__ import annotations
+
+import errno
+import re
+import shutil
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.files.places import require_file_place, require_folder_place
+
+_STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-")
+
+
+def _sibling(path: Path) -> Path:
+    return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{path.name}")
+
+
+def is_staged_for(path: Path, output: Path) -> bool:
+    """Whether `path` has the place and name of a staging folder for `output`: what a killed process may leave."""
+    output = Path(output).resolve()
+    staged = _STAGED.match(path.name)
+    return path.parent == output.parent and staged is not None and path.name[staged.end() :] == output.name
+
+
+def as_asked(path: Path | str) -> str:
+    """`path` under the name the user knows, not that of its staging place."""
+    return _STAGED.sub("", str(path))
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary sibling of `path`; rename it onto `path` on success, remove it on any failure."""
+    path = Path(path)
+    require_file_place(path)
+    made_parent = not path.parent.exists()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _sibling(path)
+    done = False
+    try:
+        yield temporary
+        temporary.replace(path)
+        done = True
+    except OSError as error:
+        raise_if_disk_full(path, error)
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+        if made_parent and not done:
+            with suppress(OSError):  # others may have written into it meanwhile
+                path.parent.rmdir()
+
+
+def raise_if_disk_full(path: Path | str, error: OSError) -> None:
+    """Turn "the disk took no more" into the one line a user needs; libraries report it in several ways."""
+    no_room = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    # Pillow's encoders and numpy's tofile report a failed write by words of their own and lose the system's number.
+    text = str(error)
+    library_failed = error.errno is None and (
+        "when writing image file" in text or ("requested and" in text and "written" in text)
+    )
+    if no_room or library_failed:
+        raise DiskFullError(
+            f"{as_asked(path)} could not be written: the disk is full; free some space and run the command again"
+        ) from None
+
+
+@contextmanager
+def atomic_directory(
+    path: Path, replace: bool = False, *, holds: str | None = None, inputs: Sequence[Path] = ()
+) -> Iterator[Path]:
+    """Yield a temporary sibling directory that becomes `path` on success and disappears on any failure.
+
+    Args:
+        replace: whether what is at `path` may go; an empty directory counts as absent.
+        holds: a file by which earlier outputs are told: a directory without it is never replaced.
+        inputs: what the output is made from; a place that holds one of them is never replaced.
+
+    Raises SplashbenchError where there is something at `path` that may not be replaced.
+    """
+    path = Path(path).resolve()  # a link stays and its target is replaced
+    _require_replaceable(path, replace, holds, inputs)
+    require_folder_place(path.parent if path.exists() else path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _sibling(path)
+    retired = _sibling(path)
+    try:
+        temporary.mkdir()
+        yield temporary
+        # Again, as another process may have made its own meanwhile.
+        _require_replaceable(path, replace, holds, inputs)
+        if path.exists():
+            path.rename(retired)
+        temporary.rename(path)
+    except OSError as error:
+        raise_if_disk_full(path, error)
+        raise
+    finally:
+        # A failed rename must not cost the user what was there before.
+        if retired.exists() and not path.exists():
+            retired.rename(path)
+        for leftover in (temporary, retired):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _require_replaceable(path: Path, replace: bool, holds: str | None, inputs: Sequence[Path]) -> None:
+    """Raise SplashbenchError unless an output may take the place `path`, resolved."""
+    for source in inputs:
+        if Path(source).resolve().is_relative_to(path):
+            raise SplashbenchError(f"{path} holds the input {source}; give another place for the output")
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not replace:
+        raise SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+    if not path.is_dir():
+        raise SplashbenchError(f"{path} is a file; give the name of a folder")
+    if holds is not None and not (path / holds).is_file():
+        raise SplashbenchError(f"{path} is no earlier output (it has no {holds}) and stays; give another place")
+
+
+@contextmanager
+def files_together(directory: Path) -> Iterator[Path]:
+    """Yield a temporary sibling of `directory`; on success its files move into `directory`, on failure none does.
+
+    Unlike `atomic_directory` it leaves other files in `directory` where they are.
+    """
+    directory = Path(directory).resolve()  # "." has no name to put one beside, and a link may lead to another disk
+    require_folder_place(directory)
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    staging = _sibling(directory)
+    try:
+        staging.mkdir()
+        yield staging
+        directory.mkdir(exist_ok=True)
+        for path in sorted(staging.iterdir()):
+            path.replace(directory / path.name)
+    except OSError as error:
+        raise_if_disk_full(directory, error)
+        raise
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` as UTF-8, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,117 @@
+"""Images read and written by imageio: 8 bits a channel, PNG or JPEG, bounded in size.
+
+Every file may come from a stranger. Its header is checked first, by Pillow, as imageio cannot be limited to formats.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.errors import SplashbenchError
+from splashbench.files.atomic import atomic_path
+from splashbench.files.places import require_plain_file
+
+MAX_PIXELS = 8192 * 8192
+# Whatever a file's name says: Pillow would hand an EPS to Ghostscript.
+_FORMATS = ("PNG", "JPEG")
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image in pixels, from its header alone."""
+    with _checked(Path(path)) as (_, size, _):
+        return size
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read an image file as sRGB uint8 [H, W, 3]; transparency is dropped."""
+    return _read_pixels(Path(path), "RGB")
+
+
+def read_rgba(path: Path) -> NDArray[np.uint8]:
+    """Read an image file as sRGB and opacity, uint8 [H, W, 4]; one without an alpha channel is refused."""
+    return _read_pixels(Path(path), "RGBA")
+
+
+def read_gray(path: Path) -> NDArray[np.uint8]:
+    """Read an image file as grey uint8 [H, W] (masks are 0 and 255)."""
+    return _read_pixels(Path(path), "L")
+
+
+@contextmanager
+def _checked(path: Path) -> Iterator[tuple[BinaryIO, tuple[int, int], str]]:
+    """Yield the open file, its (width, height) and Pillow's mode; raises SplashbenchError where it is unusable."""
+    from PIL import Image, UnidentifiedImageError
+
+    require_plain_file(path)
+    try:
+        stream = path.open("rb")
+    except FileNotFoundError:
+        raise SplashbenchError(f"{path} does not exist; restore the file") from None
+    except OSError as error:
+        raise SplashbenchError(f"{path} is not a readable image ({error}); restore the file") from None
+    with stream:
+        try:
+            with warnings.catch_warnings():
+                # The limit below is lower than Pillow's; one line says so.
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                image = Image.open(stream, formats=_FORMATS)
+        except (OSError, UnidentifiedImageError, Image.DecompressionBombError, ValueError) as error:
+            raise SplashbenchError(f"{path} is not a readable image ({error}); restore the file") from None
+        width, height = int(image.width), int(image.height)
+        if width * height > MAX_PIXELS:
+            raise SplashbenchError(f"{path} is {width}x{height}, more than {MAX_PIXELS} pixels; scale it down")
+        if image.mode.startswith(("I", "F")):
+            raise SplashbenchError(f"{path} has more than 8 bits per channel; write it as an 8-bit image")
+        stream.seek(0)
+        yield stream, (width, height), image.mode
+
+
+def _read_pixels(path: Path, mode: str) -> NDArray[np.uint8]:
+    import imageio.v3 as iio
+
+    with _checked(path) as (stream, _, file_mode):
+        if mode == "RGBA" and "A" not in file_mode:
+            raise SplashbenchError(f"{path} has no alpha channel (it is {file_mode}); restore the RGBA file")
+        try:
+            with warnings.catch_warnings():
+                # imageio looks at EXIF, of which nothing is used here; a damaged block is no reason to complain.
+                warnings.simplefilter("ignore")
+                # An animated PNG is its first image.
+                return iio.imread(stream, plugin="pillow", index=0, mode=mode, writeable_output=False)
+        except Exception as error:  # Pillow lets whatever a broken EXIF block causes through
+            raise SplashbenchError(f"{path} is cut short or damaged ({error}); restore the file") from None
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write uint8 [H, W] or [H, W, 3] losslessly as PNG, whole or not at all."""
+    write_image(path, image)
+
+
+def write_image(path: Path, image: NDArray[np.uint8], quality: int = 97) -> None:
+    """Write uint8 [H, W] or [H, W, 3] in the format of the file's ending (.png lossless, .jpg at `quality`)."""
+    path = Path(path)
+    # Level 1: our images are small and many; the higher levels cost far more time than they save space.
+    options: dict[str, Any] = {"compress_level": 1} if path.suffix == ".png" else {"quality": quality, "subsampling": 0}
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        _encode(stream, image, path.suffix, options)
+
+
+def jpeg_bytes(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Encode uint8 [H, W] or [H, W, 3] as a JPEG file's bytes, for pages that hold images (chroma at half size)."""
+    return _encode("<bytes>", image, ".jpg", {"quality": quality})
+
+
+def _encode(target: BinaryIO | str, image: NDArray[np.uint8], extension: str, options: dict[str, Any]) -> Any:
+    import imageio.v3 as iio
+
+    if image.dtype != np.uint8:
+        raise TypeError(f"images are written from uint8, not {image.dtype}")
+    pixels = np.ascontiguousarray(image)
+    return iio.imwrite(target, pixels, plugin="pillow", extension=extension.lower(), is_batch=False, **options)

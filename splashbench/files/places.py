@@ -1,0 +1,37 @@
+"""Whether a file can be read from a place or written to it: asked before long work."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from splashbench.errors import SplashbenchError
+
+
+def require_file_place(path: Path) -> None:
+    """Raise SplashbenchError where a file cannot take the place `path`: before long work."""
+    if Path(path).is_dir():
+        raise SplashbenchError(f"{path} is a folder; give the name of a file")
+    require_folder_place(Path(path).parent)
+
+
+def require_folder_place(directory: Path) -> None:
+    """Raise SplashbenchError where `directory` is or lies below a file, or may not be written: before long work."""
+    place = Path(directory).resolve()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise SplashbenchError(f"{place} is a file; give another place for {directory}")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise SplashbenchError(f"{place} may not be written; give another place for {directory}")
+
+
+def require_plain_file(path: Path) -> None:
+    """Raise SplashbenchError for a folder, a pipe or a device: reading it would fail oddly, or wait for ever.
+
+    A file that does not exist is left to the reader.
+    """
+    if path.exists() and not path.is_file():
+        raise SplashbenchError(
+            f"{path} is {'a folder' if path.is_dir() else 'a device or pipe'}, not a file; restore it"
+        )
