@@ -1,0 +1,278 @@
+"""`make pictures`: every picture of README.md and of the site, drawn anew into docs/images.
+
+A scene and fits go into build/pictures; what is there already is kept. The speed-against-accuracy chart is drawn
+from leaderboards/synthetic.csv alone. `python docs/tools/pictures.py chart` draws one of the groups below.
+"""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from splashbench.report.charts import speed_accuracy_chart
+from splashbench.report.contact_sheet import contact_sheet
+from splashbench.report.results import ResultFile
+from splashbench.scene import Scene
+from splashbench.score.metrics import METRICS
+from splashbench.score.result import Digests, Result, metric_value
+from splashbench.score.settings import PROTOCOL_V1
+from splashbench.submission import Submission
+
+ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "docs" / "images"
+WORK = ROOT / "build" / "pictures"
+SCENE = WORK / "scene"
+LEADERBOARD = ROOT / "leaderboards" / "synthetic.csv"
+#: Settings of the rows of the leaderboard in which splashsplat is told masks alone (leaderboards/README.md).
+MASKS_ALONE = "4927688d"
+METHODS = {"splashsplat": "SplashSplat (this project)", "scaffold_4d": "4D-Scaffold-GS (best baseline)"}
+#: Far below and left of what the chart is about; the table beside it has them.
+FAR_OFF = ("hull_points", "nearest_camera", "nothing")
+VIEW, FRAME = "6", 8
+ORANGE, BLUE = "#E69F00", "#0072B2"
+
+
+def main(names: Sequence[str]) -> None:
+    """Draw the groups of pictures that `names` lists; all of them by default."""
+    matplotlib.rcParams.update({"font.family": "DejaVu Sans", "font.size": 10})
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    for name in names or GROUPS:
+        for path in GROUPS[name]():
+            print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
+
+
+def made(folder: Path, *command: str) -> Path:
+    """`folder`, made by a splashbench command unless it is there."""
+    if not folder.exists():
+        subprocess.run([sys.executable, "-m", "splashbench", *command], check=True)
+    return folder
+
+
+def fits() -> tuple[Scene, dict[str, Submission]]:
+    """The synthetic scene, and the methods of METHODS on it."""
+    made(SCENE, "synth", "scene", "opaque_bowl", str(SCENE), "--size", "480x320", "--timesteps", "12")
+    submissions = {}
+    for name in METHODS:
+        out = WORK / "submissions" / name
+        submissions[name] = Submission.open(made(out, "run", name, str(SCENE), str(out), "--preset", "quick"))
+    return Scene.open(SCENE), submissions
+
+
+def store(figure: Figure, name: str, dpi: int = 150, colours: int = 256) -> Path:
+    """Write the figure as a PNG without margins."""
+    path = IMAGES / name
+    figure.savefig(path, dpi=dpi, facecolor="white", bbox_inches="tight", pad_inches=0.05, metadata={"Software": None})
+    return shrink(path, path, colours=colours)
+
+
+def shrink(source: Path, path: Path, width: int | None = None, colours: int = 256) -> Path:
+    """Write the picture `source` with at most `colours` colours (0: all), and scaled down to `width` pixels."""
+    image = Image.open(source).convert("RGB")
+    if width and width < image.width:
+        image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+    small = image.quantize(colours, dither=Image.Dither.NONE) if colours else image
+    small.save(path, optimize=True)
+    return path
+
+
+def bare(axes: Axes, title: str = "") -> Axes:
+    """Axes for an image: no ticks, no frame."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_title(title, fontsize=10)
+    return axes
+
+
+def window(mask: NDArray[np.bool_], margin: int = 14) -> tuple[slice, slice]:
+    """Rows and columns around the pixels of `mask`."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(0, rows[0] - margin), rows[-1] + margin + 1),
+        slice(max(0, columns[0] - margin), columns[-1] + margin + 1),
+    )
+
+
+def test_view() -> list[Path]:
+    """The first picture of README.md: truth, splashsplat, the best baseline, and the liquid's opacity below."""
+    scene, submissions = fits()
+    mask = scene.mask(VIEW, FRAME)
+    crop = window(mask)
+    columns = [("truth", scene.image(VIEW, FRAME), mask.astype(np.float32))]
+    columns += [(METHODS[n], s.rendering(VIEW, FRAME), s.alpha(VIEW, FRAME)) for n, s in submissions.items()]
+    height = (crop[0].stop - crop[0].start) / (crop[1].stop - crop[1].start)
+    figure = Figure(figsize=(9, 6 * height + 0.5), layout="constrained")
+    grid = figure.subplots(2, len(columns))
+    for (title, picture, opacity), (top, bottom) in zip(columns, grid.T):
+        bare(top, title).imshow(picture[crop], interpolation="lanczos")
+        bare(bottom).imshow(opacity[crop], cmap="gray", vmin=0, vmax=1)
+        bottom.contour(mask[crop], levels=[0.5], colors=[ORANGE], linewidths=0.8)
+    grid[0, 0].set_ylabel("picture")
+    grid[1, 0].set_ylabel("opacity of the liquid")
+    return [store(figure, "test_view.png", 110)]
+
+
+def chart() -> list[Path]:
+    """The speed-against-accuracy chart of the committed leaderboard."""
+    with LEADERBOARD.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["method"] not in FAR_OFF]
+    sources = [ResultFile(f"{i}.json", result_of(row)) for i, row in enumerate(rows)]
+    drawn, unused = speed_accuracy_chart(sources, IMAGES)
+    unused.unlink()
+    return [shrink(drawn, drawn, 1250)]
+
+
+def result_of(row: dict[str, str]) -> Result:
+    """A row of the leaderboard as a result: its medians, under the name that the chart is to show."""
+    alone = row["settings_digest"] == MASKS_ALONE
+    cpu, _, cores = row["hardware"].rpartition(", ")
+    figures = {name: float(row[name]) if row.get(name) else None for name in METRICS}
+    return Result(
+        method=row["method"] + (", masks alone" if alone else ""),
+        method_version=row["method_version"],
+        scene=row["scene"],
+        seed=0,
+        preset=row["preset"],
+        control=row["control"] == "true",
+        mixed=row["mixed"] == "true",
+        status=row["status"],
+        protocol=PROTOCOL_V1,
+        digests=Digests(scene=row["scene_digest"], submission=row["settings_digest"], protocol=PROTOCOL_V1.digest),
+        metrics={name: metric_value(name, value, "not in the leaderboard") for name, value in figures.items()},
+        hardware={"cpu": cpu, "cores": int(cores.split()[0])},
+    )
+
+
+def method() -> list[Path]:
+    """The figures of docs/method.md: silhouettes, signed distance, carriers, rendering; and how long carriers live."""
+    scene, submissions = fits()
+    submission = submissions["splashsplat"]
+    particles = submission.particles()
+    assert particles is not None
+    return [silhouettes(scene), four_steps(scene, submission), lives(particles.active, scene.times)]
+
+
+def silhouettes(scene: Scene) -> Path:
+    """The training views of one timestep with the outline of their masks."""
+    figure = Figure(figsize=(10, 1.75), layout="constrained")
+    for name, axes in zip(scene.train, figure.subplots(1, len(scene.train))):
+        mask = scene.mask(name, FRAME)
+        crop = window(mask, 20)
+        bare(axes, f"training view {name}").imshow(scene.image(name, FRAME)[crop])
+        axes.contour(mask[crop], levels=[0.5], colors=[ORANGE], linewidths=1)
+    return store(figure, "method_silhouettes.png", 130)
+
+
+def four_steps(scene: Scene, submission: Submission) -> Path:
+    """Signed distance, carriers with their speed, opacity and rendering of one timestep."""
+    geometry, particles = submission.geometry(), submission.particles()
+    assert geometry is not None
+    assert particles is not None
+    camera = scene.cameras[VIEW]
+    crop = window(scene.mask(VIEW, FRAME))
+    figure = Figure(figsize=(10.5, 3.1), layout="constrained")
+    left, middle, right, last = figure.subplots(1, 4)
+
+    phi = geometry.phi[FRAME].astype(np.float32) / 16
+    up = int(np.abs(scene.gravity).argmax()) if scene.gravity is not None else 1
+    across = max((axis for axis in range(3) if axis != up), key=lambda axis: phi.shape[axis])
+    nearest = np.moveaxis(phi, (up, across), (0, 1)).min(axis=2)
+    upwards = scene.gravity is None or scene.gravity[up] < 0
+    bare(left, "signed distance").set_anchor("N")
+    drawn = left.imshow(nearest, cmap="RdBu", vmin=-8, vmax=8, origin="lower" if upwards else "upper")
+    left.contour(nearest, levels=[0], colors="black", linewidths=0.8)
+    figure.colorbar(drawn, ax=left, location="bottom", shrink=0.8, label="voxels, least along the depth")
+
+    pixels, _ = camera.project(particles.at(FRAME))
+    velocities = particles.velocities
+    speed = (
+        np.zeros(len(pixels))
+        if velocities is None
+        else np.linalg.norm(velocities[FRAME][particles.active[FRAME]], axis=1)
+    )
+    bare(middle, "carriers and their speed").imshow(scene.image(VIEW, FRAME), alpha=0.25)
+    dots = middle.scatter(*pixels.T, c=speed * (scene.metres_per_unit or 1), s=1.2, cmap="viridis", linewidths=0)
+    figure.colorbar(dots, ax=middle, location="bottom", shrink=0.8, label="m/s")
+    middle.set_xlim(crop[1].start, crop[1].stop)
+    middle.set_ylim(crop[0].stop, crop[0].start)
+
+    shown = bare(right, "opacity of their Gaussians").imshow(
+        submission.alpha(VIEW, FRAME)[crop], cmap="gray", vmin=0, vmax=1
+    )
+    figure.colorbar(shown, ax=right, location="bottom", shrink=0.8, label="0 to 1")
+    bare(last, "rendered, test view").imshow(submission.rendering(VIEW, FRAME)[crop])
+    return store(figure, "method_steps.png", 110, colours=0)
+
+
+def lives(active: NDArray[np.bool_], times: NDArray[np.float64]) -> Path:
+    """How many carriers of each frame were born there, and how many came from an earlier frame."""
+    born = active & ~np.roll(active, 1, axis=0)
+    born[0] = active[0]
+    new, older = born.sum(axis=1), (active & ~born).sum(axis=1)
+    figure = Figure(figsize=(6.5, 2.4), layout="constrained")
+    axes = figure.subplots()
+    width = 0.8 * float(np.diff(times).mean()) * 1000
+    axes.bar(times * 1000, older, width, color=BLUE, label="carried from the frame before")
+    axes.bar(times * 1000, new, width, bottom=older, color=ORANGE, label="new in this frame")
+    axes.set_xlabel("time, ms")
+    axes.set_ylabel("carriers")
+    axes.legend(frameon=False, fontsize=9)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    return store(figure, "method_carriers.png", 130)
+
+
+def tutorial() -> list[Path]:
+    """The pictures of docs/tutorial.md: all cameras, and what scoring and the leaderboard draw."""
+    scene, submissions = fits()
+    runs = [WORK / "submissions" / name for name in ("nothing", "hull_points")]
+    made(runs[0], "run", "nothing", str(SCENE), str(runs[0]), "--preset", "quick")
+    made(runs[1], "run", "hull_points", str(SCENE), str(runs[1]))
+    runs += [submissions["splashsplat"].directory]
+    results, sheet = WORK / "results", WORK / "sheet.png"
+    paths = [str(path) for path in (*runs, submissions["scaffold_4d"].directory)]
+    scored = ["--scene", str(SCENE), "--out", str(results), "--reference", paths[0]]
+    made(results, "score", *paths, *scored)
+    contact_sheet(scene, [Submission.open(path) for path in runs], sheet, [FRAME // 2, FRAME])
+    with_chart = made(WORK / "leaderboard", "leaderboard", str(results), str(WORK / "leaderboard"))
+    return [
+        all_cameras(scene),
+        shrink(sheet, IMAGES / "tutorial_contact_sheet.png", 1000),
+        shrink(with_chart / "speed_accuracy.png", IMAGES / "tutorial_chart.png", 1100),
+    ]
+
+
+def all_cameras(scene: Scene) -> Path:
+    """Every camera at one timestep with the outline of its mask."""
+    figure = Figure(figsize=(10.5, 3.9), layout="constrained")
+    grid = figure.subplots(2, 4).ravel()
+    for axes in grid:
+        axes.set_axis_off()
+    for name, axes in zip([*scene.train, *scene.test], grid):
+        axes.set_axis_on()
+        bare(axes, f"camera {name}, {'test' if name in scene.test else 'training'}").imshow(scene.image(name, FRAME))
+        axes.contour(scene.mask(name, FRAME), levels=[0.5], colors=[ORANGE], linewidths=0.6)
+    return store(figure, "tutorial_scene.png", 110)
+
+
+#: What `main` draws, by name.
+GROUPS: dict[str, Callable[[], list[Path]]] = {
+    "chart": chart,
+    "test_view": test_view,
+    "method": method,
+    "tutorial": tutorial,
+}
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
