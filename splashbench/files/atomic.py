@@ -55,8 +55,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
                 path.parent.rmdir()
 
 
-def raise_if_disk_full(path: Path | str, error: OSError) -> None:
+def raise_if_disk_full(path: Path | str, error: Exception) -> None:
     """Turn "the disk took no more" into the one line a user needs; libraries report it in several ways."""
+    if isinstance(error, DiskFullError):
+        raise error
+    if not isinstance(error, OSError):
+        return
     no_room = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     # Pillow's encoders and numpy's tofile report a failed write by words of their own and lose the system's number.
     text = str(error)

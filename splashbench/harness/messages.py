@@ -8,9 +8,6 @@ from pydantic import BaseModel, ConfigDict
 
 from splashbench.submission import Status
 
-#: Exit code of a child that could not write; the last line of its log says which file.
-DISK_FULL_EXIT = 28
-
 
 class Request(BaseModel):
     """What a child process is to do: `phase` fit (scene -> model), import (somebody's output -> model), render (model
@@ -22,8 +19,6 @@ class Request(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     phase: Literal["fit", "import", "render"]
-    #: The process that waits for the child, and without which the child must not go on.
-    harness: int
     method: str
     scene: str
     preset: str

@@ -9,7 +9,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
 import uuid
 from dataclasses import dataclass
@@ -38,26 +37,6 @@ class Watched:
     log_tail: list[str]
     seconds: float
     strays: list[str]
-
-
-def run_watched(
-    arguments: list[str],
-    *,
-    log: Path,
-    progress: Path,
-    label: str,
-    timeout_seconds: float | None,
-    keep_bar: bool = True,
-) -> Watched:
-    """Run `python ARGUMENTS`; see `watch`."""
-    return watch(
-        [sys.executable, *arguments],
-        log=log,
-        progress=progress,
-        label=label,
-        timeout_seconds=timeout_seconds,
-        keep_bar=keep_bar,
-    )
 
 
 def watch(

@@ -24,10 +24,10 @@ from splashbench.version import __version__
 
 T = TypeVar("T")
 
-_FACTS = "reuse.json"
+_RECORD = "reuse.json"
 
 
-class Facts(BaseModel):
+class PartRecord(BaseModel):
     """reuse.json: what the part is, by everything it depends on, and how long its fit took."""
 
     model_config = ConfigDict(extra="forbid")
@@ -67,20 +67,20 @@ def reuse(
     others wait.
     """
     start = time.perf_counter()
-    whole = {"splashbench": __version__, "scene": scene_digest, **key}
-    digest = hashlib.sha256(json.dumps([name, whole], sort_keys=True).encode()).hexdigest()[:16]
+    dependencies = {"splashbench": __version__, "scene": scene_digest, **key}
+    digest = hashlib.sha256(json.dumps([name, dependencies], sort_keys=True).encode()).hexdigest()[:16]
     place = Path(cache, f"{name}-{digest}")
     place.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(place.with_suffix(".lock")):
-        if (place / _FACTS).is_file():
-            value, facts = load(place), read_model(place / _FACTS, Facts)
-            return Part(value, facts.seconds, time.perf_counter() - start)
+        if (place / _RECORD).is_file():
+            value, record = load(place), read_model(place / _RECORD, PartRecord)
+            return Part(value, record.seconds, time.perf_counter() - start)
         before_fit = time.perf_counter()
         value = fit()
         after_fit = time.perf_counter()
         with atomic_directory(place) as staging:
             save(value, staging)
-            write_model(staging / _FACTS, Facts(name=name, key=whole, seconds=after_fit - before_fit))
+            write_model(staging / _RECORD, PartRecord(name=name, key=dependencies, seconds=after_fit - before_fit))
         return Part(value, None, time.perf_counter() - start - (after_fit - before_fit))
 
 

@@ -6,7 +6,6 @@ every case: with renders when the run is `ok`, else with a status and a reason.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,13 +13,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.child import child_command, raise_if_disk_was_full
+from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_model, tree_bytes, write_model
-from splashbench.harness import hardware
+from splashbench.harness import hardware, method_process
 from splashbench.harness.contract import Method
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
-from splashbench.harness.messages import DISK_FULL_EXIT, Outcome, Request
-from splashbench.harness.process import Watched, run_watched
+from splashbench.harness.messages import Outcome, Request
+from splashbench.harness.process import Watched, watch
 from splashbench.harness.training_copy import make_training_view
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
@@ -102,7 +102,6 @@ def run_method(
             staging,
             Request(
                 phase="fit",
-                harness=os.getpid(),
                 method=name,
                 scene=str(make_training_view(scene, Path(scratch, "scene"), kept_timesteps(scene.n_frames, withheld))),
                 preset=preset,
@@ -214,15 +213,14 @@ def run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Wat
     for stale in (result, progress):
         stale.unlink(missing_ok=True)
     write_model(path, request)
-    watched = run_watched(
-        ["-m", "splashbench.harness.child", str(path)],
+    watched = watch(
+        child_command(method_process.carry_out, path),
         log=scratch / "log",
         progress=progress,
         label=label,
         timeout_seconds=request.budget_seconds,
     )
-    if watched.exit_code == DISK_FULL_EXIT:
-        raise DiskFullError(watched.log_tail[-1] if watched.log_tail else "the disk is full; free some space")
+    raise_if_disk_was_full(watched.exit_code, watched.log_tail)
     if watched.timed_out:
         outcome = Outcome(status=Status.TIMEOUT, reason=f"the {request.phase} took over {request.budget_seconds:g} s")
     elif result.is_file() and watched.exit_code == 0:

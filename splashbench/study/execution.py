@@ -6,10 +6,8 @@ Killed at any time, a study loses the runs in progress. A run that fails is an e
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -19,11 +17,11 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.child import child_command, raise_if_disk_was_full
+from splashbench.errors import SplashbenchError
 from splashbench.files import require_folder_place, write_model, write_text
-from splashbench.harness.messages import DISK_FULL_EXIT
 from splashbench.score.image.lpips import load_lpips
-from splashbench.study.job import ERROR, Job, RunEntry, Store, carry_out
+from splashbench.study.job import ERROR, Job, RunEntry, Store, carry_out, carry_out_file
 from splashbench.study.plan import PlannedRun, StudyPlan
 
 _MARK = ".splashbench_study"
@@ -187,10 +185,13 @@ class _Worker:
         scratch = self._store.cache / "jobs"
         request, self._log = scratch / f"{job.digest[:16]}.json", scratch / f"{job.digest[:16]}.log"
         write_model(request, job)
-        command = [sys.executable, "-m", "splashbench.study.job", str(os.getpid()), str(request)]
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+                child_command(carry_out_file, request),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
             )
 
     def has_ended(self) -> bool:
@@ -203,9 +204,8 @@ class _Worker:
             if entry is not None:
                 return entry
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        raise_if_disk_was_full(self._process.returncode, lines)
         last = lines[-1] if lines else "it said nothing"
-        if self._process.returncode == DISK_FULL_EXIT:
-            raise DiskFullError(last)
         reason = f"the run's process ended with exit code {self._process.returncode}: {last}"
         entry = RunEntry(digest=self._job.digest, title=self._job.title, status=ERROR, reason=reason)
         write_model(self._store.entry_path(self._job.digest), entry)

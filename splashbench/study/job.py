@@ -1,4 +1,4 @@
-"""One run of a study: made, scored and written down; `python -m splashbench.study.job PARENT FILE` in its own process.
+"""One run of a study: made, scored and written down, in this process or a child.
 
 What it leaves is a result in results/ and an entry in runs/, written last: a run with an entry is whole.
 """
@@ -6,7 +6,6 @@ What it leaves is a result in results/ and an entry in runs/, written last: a ru
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from splashbench.errors import DiskFullError, SplashbenchError, one_line
 from splashbench.files import read_model, write_model
-from splashbench.harness.messages import DISK_FULL_EXIT
 from splashbench.harness.runner import run_method
-from splashbench.processes import end_with_parent, terminable
+from splashbench.processes import terminable
 from splashbench.scene import Scene
 from splashbench.score import Result, score_submission, shared_fields
 from splashbench.study.scenes import changed_scene
@@ -169,19 +167,11 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     )
 
 
-def main(parent: str, file: str) -> int:
-    """Carry out the job in `file`, for as long as the process `parent` lives."""
-    end_with_parent(int(parent))
+def carry_out_file(file: str) -> int:
+    """Carry out the job in `file`: what a child process does."""
     try:
         with terminable():
             carry_out(read_model(Path(file), Job))
-    except DiskFullError as error:
-        print(error, file=sys.stderr)
-        return DISK_FULL_EXIT
     except KeyboardInterrupt:
         return 130
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))

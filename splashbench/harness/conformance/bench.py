@@ -10,15 +10,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from splashbench.errors import DiskFullError
+from splashbench.child import child_command, raise_if_disk_was_full
 from splashbench.files import read_model, write_model
+from splashbench.harness.conformance import child
 from splashbench.harness.conformance.messages import Answer, Order, Subject
 from splashbench.harness.conformance.opening import Opening
 from splashbench.harness.conformance.scenes import Place
 from splashbench.harness.conformance.stopping import MARK, processes_left
 from splashbench.harness.conformance.touched import Touch, read_touched
-from splashbench.harness.messages import DISK_FULL_EXIT
-from splashbench.harness.process import Watched, run_watched
+from splashbench.harness.process import Watched, watch
 
 
 class Bench:
@@ -54,7 +54,6 @@ class Bench:
             do=do,
             subject=subject,
             seed=seed,
-            harness=os.getpid(),
             view=str(place.view),
             scene=str(place.scene),
             model=str(model),
@@ -66,8 +65,8 @@ class Bench:
         write_model(work / "order.json", order)
         what = f"the process to {do}"
         with self.process(what), Opening(list(place.baits)) as opening:
-            watched = run_watched(
-                ["-m", "splashbench.harness.conformance.child", str(work / "order.json")],
+            watched = watch(
+                child_command(child.carry_out, work / "order.json"),
                 log=work / "log",
                 progress=work / "progress",
                 label=f"{subject.id}: {do}",
@@ -79,8 +78,7 @@ class Bench:
         self.opened |= dict.fromkeys(opening.seen)
         self.watched &= opening.complete or not place.baits
         shutil.rmtree(scratch, ignore_errors=True)  # a model that needs it is not whole
-        if watched.exit_code == DISK_FULL_EXIT:
-            raise DiskFullError(watched.log_tail[-1] if watched.log_tail else "the disk is full; free some space")
+        raise_if_disk_was_full(watched.exit_code, watched.log_tail)
         if watched.exit_code == 0 and (work / "answer.json").is_file():
             return read_model(work / "answer.json", Answer)
         return Answer(stage=do, reason=_died(watched, subject.timeout_seconds))

@@ -1,4 +1,4 @@
-"""The child process of the conformance test: `python -m splashbench.harness.conformance.child ORDER`.
+"""The child process of the conformance test, which carries out an order.
 
 Unlike the harness's child it renders in the process that fitted, so that a loaded model can be held against it, and
 records what the method touches.
@@ -14,22 +14,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from splashbench.errors import DiskFullError, SplashbenchError, one_line
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import raise_if_disk_full, read_model, write_model
 from splashbench.harness.conformance.messages import Answer, Order, Said
 from splashbench.harness.conformance.touched import Recorder
 from splashbench.harness.conformance.views import held_geometry, held_particles, look, views_of, window_fault
 from splashbench.harness.contract import Run, Support
 from splashbench.harness.discovery import load_method
-from splashbench.harness.messages import DISK_FULL_EXIT
-from splashbench.processes import end_with_parent
 from splashbench.scene import Scene
 
 
-def main(order_path: str) -> int:
-    """Carry out the order; leaves an Answer behind unless the process dies."""
+def carry_out(order_path: str) -> int:
+    """Carry out the order; leaves an Answer behind unless the process dies or the disk is full."""
     order, answer = read_model(Path(order_path), Order), Answer()
-    end_with_parent(order.harness)
     recorder = Recorder(
         Path(order.touched),
         scene=Path(order.scene),
@@ -38,16 +35,9 @@ def main(order_path: str) -> int:
     )
     try:
         with Path(order.progress).open("a", encoding="utf-8") as stream, recorder.method():
-            _carry_out(order, answer, _Reporter(stream, answer.said))
+            _answer(order, answer, _Reporter(stream, answer.said))
     except Exception as error:
-        if isinstance(error, OSError):
-            try:
-                raise_if_disk_full(error.filename or order.model, error)
-            except DiskFullError as full:
-                error = full
-        if isinstance(error, DiskFullError):
-            print(error, file=sys.stderr)
-            return DISK_FULL_EXIT
+        raise_if_disk_full(getattr(error, "filename", None) or order.model, error)
         answer.clear = isinstance(error, SplashbenchError)
         text = one_line(str(error))[:300]
         answer.reason = text if answer.clear else f"{type(error).__name__}: {text}"
@@ -60,7 +50,7 @@ def _shown(view: Path) -> set[str]:
     return {os.path.realpath(Path(root, name)) for root, _, names in os.walk(view) for name in names}
 
 
-def _carry_out(order: Order, answer: Answer, reporter: _Reporter) -> None:
+def _answer(order: Order, answer: Answer, reporter: _Reporter) -> None:
     answer.stage = "import"
     method = load_method(order.subject.method)
     scene = Scene.open(Path(order.view)).training()
@@ -131,7 +121,3 @@ class _Reporter:
         self._last = fraction
         self._stream.write(f"{fraction:.4f} {' '.join(message.split())}\n")
         self._stream.flush()
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))

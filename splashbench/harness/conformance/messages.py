@@ -29,7 +29,6 @@ class Order(BaseModel):
     do: Literal["fit", "load"]
     subject: Subject
     seed: int
-    harness: int  # the process that waits for the child, and without which the child must not go on
     view: str  # the training view that the method is given
     scene: str  # the scene that it is a view of
     model: str

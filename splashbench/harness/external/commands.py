@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from splashbench.child import child_command
 from splashbench.errors import SplashbenchError
 
 #: What may stand in a command, and what it means.
@@ -65,4 +66,17 @@ def command_line(text: str, values: Mapping[str, str], shell: bool, directory: P
         words = ["/bin/sh", "-c", _filled(text, {name: shlex.quote(value) for name, value in values.items()})]
     else:
         words = [_filled(word, values) for word in shlex.split(text)]
-    return [sys.executable, "-m", "splashbench.harness.external.launch", str(os.getpid()), str(directory), *words]
+    return child_command(become, directory, *words)
+
+
+def become(directory: str, *command: str) -> int:
+    """Turn this child process into `command` in `directory`, which then ends with the harness as the child would.
+
+    An external program does not ask the kernel to be killed when its parent dies; the child has asked already.
+    """
+    os.chdir(directory)
+    try:
+        os.execvp(command[0], command)
+    except OSError as error:
+        print(f"{command[0]}: {error.strerror or error}", file=sys.stderr)
+        return 127

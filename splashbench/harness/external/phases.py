@@ -148,7 +148,6 @@ class ExternalRun:
         model.mkdir()
         request = Request(
             phase="import",
-            harness=os.getpid(),
             method=self.code.name,
             scene=str(make_training_view(self.scene, self.scratch / "training")),
             preset="",

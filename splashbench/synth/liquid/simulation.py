@@ -12,7 +12,6 @@ import importlib.util
 import json
 import os
 import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,11 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.child import child_command
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
 from splashbench.progress import Bar
 from splashbench.synth.imaging.geometry import Mesh
-from splashbench.synth.liquid.solver import PRELOADED_LIBRARIES
+from splashbench.synth.liquid.solver import PRELOADED_LIBRARIES, solve
 from splashbench.synth.liquid.trajectory import Trajectory, assemble
 
 SNAPSHOT_SECONDS = 0.002
@@ -141,8 +141,7 @@ def start(pour: Pour, container: Mesh, directory: Path, timeout: float = TIMEOUT
     scene_file.write_text(json.dumps(_solver_scene(pour, container, directory)), encoding="utf-8")
     # One thread, and passive waiting: results that repeat, and a core left to the renderer.
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-    command = [sys.executable, "-m", "splashbench.synth.liquid.solver"]
-    command += [str(scene_file), str(directory / "snapshots.npz"), str(SNAPSHOT_SECONDS)]
+    command = child_command(solve, scene_file, directory / "snapshots.npz", str(SNAPSHOT_SECONDS))
     with (directory / "solver.log").open("w") as log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, env=environment, text=True)
     return RunningSimulation(pour, directory, process, timeout)

@@ -1,7 +1,5 @@
 """The child process that runs SPlisHSPlasH.
 
-Usage: `python -m splashbench.synth.liquid.solver SCENE.json SNAPSHOTS.npz STEP_SECONDS`.
-
 Apart from this file nothing imports pysplishsplash: its Linux wheel can end the process without a word, and a process
 of its own turns that into an exit status (`splashbench.synth.liquid.simulation` is the parent). Prints the simulated
 time, a line per snapshot, on standard output; whatever the solver says goes to standard error.
@@ -11,13 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import os
-import sys
 import tempfile
 from typing import Any
 
 import numpy as np
-
-from splashbench.processes import end_with_parent
 
 # The wheel segfaults at import unless the system's libGL is in the process already.
 PRELOADED_LIBRARIES = ("libGL.so.1", "libX11.so.6")
@@ -25,11 +20,14 @@ TABLE_HEIGHT = 0.0025  # metres: of the centres of particles that lie on the tab
 REACH = 0.5  # metres: nothing beyond it is of interest
 
 
-def main(scene_file: str, output: str, step_seconds: float) -> int:
-    """Run the scene; write times [S], counts [S] and all snapshots' ids, positions and velocities, concatenated."""
+def solve(scene_file: str, output: str, step_seconds_text: str) -> int:
+    """Run the scene in the file `scene_file`, with a snapshot every so many simulated seconds.
+
+    Writes times [S], counts [S] and all snapshots' ids, positions and velocities, concatenated, into `output`.
+    """
     progress = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # the solver logs to standard output, which here belongs to the progress lines
-    end_with_parent()
+    step_seconds = float(step_seconds_text)
     for library in PRELOADED_LIBRARIES:
         ctypes.CDLL(library)
     import pysplishsplash as sph
@@ -72,7 +70,3 @@ def main(scene_file: str, output: str, step_seconds: float) -> int:
         )
         simulator.cleanup()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], sys.argv[2], float(sys.argv[3])))

@@ -1,4 +1,4 @@
-"""The child process in which a method runs: `python -m splashbench.harness.child REQUEST`.
+"""The child process in which a method runs, fits or renders, as a request file says.
 
 This is the harness's code around the method's: it holds the clock, checks every render, and writes what came out.
 Fitting and rendering are two processes, so a model that renders only in the memory that fitted it is found out.
@@ -13,14 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
-from splashbench.errors import DiskFullError, SplashbenchError
+from splashbench.errors import SplashbenchError
 from splashbench.files import raise_if_disk_full, read_model, write_model
 from splashbench.harness.contract import Fitted, Method, Run
 from splashbench.harness.discovery import load_method
 from splashbench.harness.external.importers import Importer, load_importer
-from splashbench.harness.messages import DISK_FULL_EXIT, Failure, Outcome, Request
+from splashbench.harness.messages import Failure, Outcome, Request
 from splashbench.harness.output_checks import check_geometry, check_particles, checked_render
-from splashbench.processes import end_with_parent
 from splashbench.scene import Camera, Scene, TrainingScene
 from splashbench.submission import Status, to_8bit, write_view
 from splashbench.submission.exr import write_exr
@@ -28,10 +27,9 @@ from splashbench.submission.exr import write_exr
 WARM_UP_FRAMES = 10
 
 
-def main(request_path: str) -> int:
-    """Carry out the request; always leaves an Outcome behind unless the process dies."""
+def carry_out(request_path: str) -> int:
+    """Carry out the request; always leaves an Outcome behind unless the process dies or the disk is full."""
     request = read_model(Path(request_path), Request)
-    end_with_parent(request.harness)
     phases: dict[str, Callable[[Request, Any, TrainingScene], Outcome]] = {
         "fit": _fit,
         "import": _import,
@@ -45,14 +43,8 @@ def main(request_path: str) -> int:
         outcome = Outcome(status=failure.status, reason=failure.reason)
     except MemoryError as error:
         outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=f"out of memory {error}".strip())
-    except DiskFullError as error:
-        return _disk_full(error)
     except Exception as error:
-        if isinstance(error, OSError):
-            try:  # a writer of the method's own
-                raise_if_disk_full(error.filename or request.model, error)
-            except DiskFullError as full:
-                return _disk_full(full)
+        raise_if_disk_full(getattr(error, "filename", None) or request.model, error)
         if "out of memory" in str(error).lower():
             outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=_one_line(error))
         else:
@@ -62,12 +54,6 @@ def main(request_path: str) -> int:
             outcome = Outcome(status=Status.CRASHED, reason=_one_line(error))
     write_model(Path(request.result), outcome)
     return 0
-
-
-def _disk_full(error: DiskFullError) -> int:
-    """Not the method's failure: the parent reads this last line and tells the user."""
-    print(error, file=sys.stderr)
-    return DISK_FULL_EXIT
 
 
 def _one_line(error: BaseException) -> str:
@@ -212,7 +198,3 @@ def _renderers() -> list[str]:
     """The backends of the shared renderer that this process used."""
     counters = sys.modules.get("splashbench.render.counters")
     return list(counters.backends()) if counters is not None else []
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,48 @@
+"""The one entry of child processes: `python -m splashbench.child PARENT MODULE:FUNCTION ARGUMENT...`.
+
+A task is a function of the room that needs the process. It takes its arguments as text and returns the exit code. What
+all children share is here: they end with the process that started them, and report a full disk by an exit code of its
+own. Nothing heavy is imported, since an external code's time runs already.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+
+from splashbench.errors import DiskFullError
+from splashbench.processes import end_with_parent
+
+#: Exit code of a child that could not write; the last line of its log says which file.
+DISK_FULL_EXIT = 28
+
+
+def child_command(task: Callable[..., int], *arguments: str | Path) -> list[str]:
+    """The command line of a child process of this one that carries out `task(*arguments)`."""
+    name = f"{task.__module__}:{task.__qualname__}"
+    return [sys.executable, "-m", "splashbench.child", str(os.getpid()), name, *map(str, arguments)]
+
+
+def raise_if_disk_was_full(exit_code: int | None, log: Sequence[str]) -> None:
+    """Raise DiskFullError where a child ended for that; `log`: the last lines that it wrote."""
+    if exit_code == DISK_FULL_EXIT:
+        raise DiskFullError(log[-1] if log else "the disk is full; free some space")
+
+
+def main(parent: str, task: str, *arguments: str) -> int:
+    """Carry out `task`, MODULE:FUNCTION, for as long as the process `parent` lives."""
+    end_with_parent(int(parent))
+    module, _, function = task.partition(":")
+    try:
+        exit_code: int = getattr(import_module(module), function)(*arguments)
+    except DiskFullError as error:  # no task's own failure: the parent reads this last line and tells the user
+        print(error, file=sys.stderr)
+        return DISK_FULL_EXIT
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
