@@ -108,7 +108,8 @@ def _describe(arguments: argparse.Namespace) -> int:
 
     found = describe(arguments.session, arguments.square_metres, arguments.replace)
     rows = [
-        [film.camera or "-", film.filmed or "not used", str(len(film.files)), film.files[0]] for film in found.films
+        [video.camera or "-", video.subject or "not used", str(len(video.files)), video.files[0]]
+        for video in found.recordings
     ]
     say(table(["camera", "shows", "files", "first file"], rows))
     if found.board is not None:
@@ -122,7 +123,7 @@ def _describe(arguments: argparse.Namespace) -> int:
             {
                 "session": str(found.path),
                 "cameras": list(found.cameras),
-                "films": [{"camera": f.camera, "shows": f.filmed, "files": list(f.files)} for f in found.films],
+                "films": [{"camera": r.camera, "shows": r.subject, "files": list(r.files)} for r in found.recordings],
                 "board": vars(found.board) if found.board else None,
                 "to_do": list(found.to_do),
             }
@@ -139,7 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.square_metres is not None:
         arguments.usage_error("--square-metres goes with --init")
     from splashbench.errors import SplashbenchError
-    from splashbench.prepare.pipeline import Options, prepare
+    from splashbench.prepare.pipeline import PrepareOptions, prepare
 
     interval = None
     if arguments.interval is not None:
@@ -148,7 +149,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise SplashbenchError(
                 f"--interval {interval[0]:g} {interval[1]:g}: give seconds, START before END, both below a million"
             )
-    options = Options(
+    options = PrepareOptions(
         masks=arguments.masks,
         timesteps=arguments.timesteps,
         interval=interval,

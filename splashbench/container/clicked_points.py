@@ -1,9 +1,11 @@
-"""Placing the container by points that someone clicked: a point of the mesh and its pixels in several images.
+"""Placing the container by clicked points: a point of the mesh and its pixels in several images.
 
-Clicks that two cameras share are triangulated and aligned with the mesh in closed form (Umeyama, IEEE TPAMI 13(4),
-1991), by the three of them that agree best with all the others, so that one click on the wrong corner does not spoil
-the start; where too few are shared, one camera alone gives the start (perspective from n points). Then all clicks of
-all cameras decide together by their distance in the images, under a loss that bounds what one of them can do.
+The start: points clicked in two cameras are triangulated and aligned with the mesh in closed form (`umeyama`). The
+three that agree best with all the others decide, so that one click on the wrong corner does not spoil the start. Where
+too few are shared, one camera alone gives the start (perspective from n points).
+
+The fit: all clicks of all cameras decide together by their distance in the images, under a loss that bounds what one of
+them can do.
 """
 
 from __future__ import annotations
@@ -15,24 +17,24 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.container.alignment import Stance
-from splashbench.container.contours import Array
-from splashbench.container.placement import Axis, Placement, direction
+from splashbench.alignment import triangulate, umeyama
+from splashbench.arrays import Floats
+from splashbench.container.placement import Placement
+from splashbench.container.stance import Axis, Stance, direction
 from splashbench.container.verification import verify
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.poses.metric import triangulate, umeyama
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
 # Clicks further off than a few pixels lose their weight (Cauchy's loss).
 _CLICK_PX = 3.0
-_MOST_TRIPLES = 400
+_MAX_TRIPLES = 400
 # Points whose extent across their longest line is less than this share of it lie on a line.
 _LINE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Click:
+class ClickedPoint:
     """A point [3] of the mesh and where cameras see it: camera name -> (u, v) in pixels, pixel centres at +0.5."""
 
     point: tuple[float, float, float]
@@ -42,7 +44,7 @@ class Click:
 def place_by_points(
     mesh: ContainerMesh,
     cameras: Sequence[Camera],
-    clicks: Sequence[Click],
+    clicks: Sequence[ClickedPoint],
     *,
     up: Axis = "y",
     metres_per_unit: float | None = 1.0,
@@ -60,21 +62,21 @@ def place_by_points(
     """
     names = {camera.name for camera in cameras}
     points = np.array([click.point for click in clicks], dtype=np.float64).reshape(-1, 3)
-    seen = [{name: np.array(pixel) for name, pixel in click.pixels.items() if name in names} for click in clicks]
-    used = [camera for camera in cameras if any(camera.name in pixels for pixels in seen)]
-    _require_spread(points[[bool(pixels) for pixels in seen]], source)
-    start = _start(used, points, seen, metres_per_unit, source)
+    clicked = [{name: np.array(pixel) for name, pixel in click.pixels.items() if name in names} for click in clicks]
+    used = [camera for camera in cameras if any(camera.name in pixels for pixels in clicked)]
+    _require_spread(points[[bool(pixels) for pixels in clicked]], source)
+    start = _start(used, points, clicked, metres_per_unit, source)
 
     from scipy.optimize import least_squares
 
     observed = [
-        (k, camera, pixels[camera.name]) for camera in used for k, pixels in enumerate(seen) if camera.name in pixels
+        (k, camera, pixels[camera.name]) for camera in used for k, pixels in enumerate(clicked) if camera.name in pixels
     ]
     centre = points.mean(axis=0)
     length = float(np.linalg.norm(points - centre, axis=1).max()) * start.scale
     free = 7 if metres_per_unit is None else 6
 
-    def residuals(step: Array) -> Array:
+    def residuals(step: Floats) -> Floats:
         return _errors(start.moved(step, length), centre, points, observed).ravel()
 
     if 2 * len(observed) < free:
@@ -104,7 +106,7 @@ def place_by_points(
     )
 
 
-def _require_spread(points: Array, source: str) -> None:
+def _require_spread(points: Floats, source: str) -> None:
     if len(points) < 3:
         raise SplashbenchError(
             f"{source}: {len(points)} points are seen by cameras to fit, three are needed; click more"
@@ -114,82 +116,84 @@ def _require_spread(points: Array, source: str) -> None:
         raise SplashbenchError(f"{source}: all points lie on a line; click one beside it")
 
 
-def _errors(stance: Stance, centre: Array, points: Array, observed: Sequence[tuple[int, Camera, Array]]) -> Array:
+def _errors(stance: Stance, centre: Floats, points: Floats, observed: Sequence[tuple[int, Camera, Floats]]) -> Floats:
     """Distances [N, 2] in pixels of the placed points from their clicks."""
     placed = stance.scale * (points - centre) @ stance.rotation.T + stance.position
     return np.array([camera.project(placed[k : k + 1])[0][0] - pixel for k, camera, pixel in observed])
 
 
 def _start(
-    cameras: Sequence[Camera], points: Array, seen: Sequence[Mapping[str, Array]], scale: float | None, source: str
+    cameras: Sequence[Camera], points: Floats, clicked: Sequence[Mapping[str, Floats]], scale: float | None, source: str
 ) -> Stance:
     """The placement to begin with, of the points less their mean."""
     by_name = {camera.name: camera for camera in cameras}
-    shared = [k for k, pixels in enumerate(seen) if len(pixels) >= 2]
+    shared = [k for k, pixels in enumerate(clicked) if len(pixels) >= 2]
     centre = points.mean(axis=0)
-    options: list[Stance] = []
+    candidates: list[Stance] = []
     if len(shared) >= 3:
-        placed = np.array([_triangulated(by_name, seen[k]) for k in shared])
+        placed = np.array([_triangulated(by_name, clicked[k]) for k in shared])
         for triple in _triples(len(shared)):
             source_points = points[[shared[k] for k in triple]] - centre
             spread = np.linalg.svd(source_points - source_points.mean(axis=0), compute_uv=False)
             if spread[1] > _LINE * spread[0]:
-                options.append(_aligned(source_points, placed[list(triple)], scale))
-        options.append(_aligned(points[shared] - centre, placed, scale))
+                candidates.append(_aligned(source_points, placed[list(triple)], scale))
+        candidates.append(_aligned(points[shared] - centre, placed, scale))
     if scale is not None:
-        options += [
-            option
+        candidates += [
+            candidate
             for camera in cameras
-            if (option := _from_one_camera(camera, points - centre, seen, scale)) is not None
+            if (candidate := _from_one_camera(camera, points - centre, clicked, scale)) is not None
         ]
-    if not options:
+    if not candidates:
         raise SplashbenchError(
             f"{source}: no three points are clicked in two cameras each, nor four in one with the scale known;"
             " click the same points in more cameras"
         )
-    observed = [(k, by_name[name], pixel) for k, pixels in enumerate(seen) for name, pixel in pixels.items()]
+    observed = [(k, by_name[name], pixel) for k, pixels in enumerate(clicked) for name, pixel in pixels.items()]
 
-    def typical(option: Stance) -> float:
-        errors = np.linalg.norm(_errors(option, centre, points, observed), axis=1)
+    def typical_error(candidate: Stance) -> float:
+        errors = np.linalg.norm(_errors(candidate, centre, points, observed), axis=1)
         return float(np.median(errors) + 1e-3 * np.mean(np.minimum(errors, 1e3)))
 
-    return min(options, key=typical)
+    return min(candidates, key=typical_error)
 
 
 def _triples(n: int) -> list[tuple[int, ...]]:
     """Every three of n, or evenly spaced ones of them where there are too many."""
     count = n * (n - 1) * (n - 2) // 6
-    if count <= _MOST_TRIPLES:
+    if count <= _MAX_TRIPLES:
         return list(combinations(range(n), 3))
     rng = np.random.default_rng(0)
-    return [tuple(rng.choice(n, 3, replace=False).tolist()) for _ in range(_MOST_TRIPLES)]
+    return [tuple(rng.choice(n, 3, replace=False).tolist()) for _ in range(_MAX_TRIPLES)]
 
 
-def _triangulated(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Array:
+def _triangulated(cameras: Mapping[str, Camera], pixels: Mapping[str, Floats]) -> Floats:
     rays = [np.linalg.solve(cameras[name].K, np.append(pixel, 1.0))[:2] for name, pixel in pixels.items()]
     return triangulate(np.array(rays), np.array([cameras[name].w2c for name in pixels]))
 
 
-def _aligned(points: Array, placed: Array, scale: float | None) -> Stance:
-    found = umeyama(points, placed)
+def _aligned(points: Floats, placed: Floats, scale: float | None) -> Stance:
+    similarity = umeyama(points, placed)
     # The best rotation does not depend on the scale.
-    size = found.scale if scale is None else scale
-    return Stance(size, found.rotation, placed.mean(axis=0) - size * found.rotation @ points.mean(axis=0))
+    size = similarity.scale if scale is None else scale
+    return Stance(size, similarity.rotation, placed.mean(axis=0) - size * similarity.rotation @ points.mean(axis=0))
 
 
-def _from_one_camera(camera: Camera, points: Array, seen: Sequence[Mapping[str, Array]], scale: float) -> Stance | None:
+def _from_one_camera(
+    camera: Camera, points: Floats, clicked: Sequence[Mapping[str, Floats]], scale: float
+) -> Stance | None:
     """From four or more clicks in one image (SQPnP, Terzakis and Lourakis, ECCV 2020)."""
     import cv2
 
-    chosen = [k for k, pixels in enumerate(seen) if camera.name in pixels]
+    chosen = [k for k, pixels in enumerate(clicked) if camera.name in pixels]
     if len(chosen) < 4:
         return None
-    pixels = np.array([seen[k][camera.name] for k in chosen])
+    pixels = np.array([clicked[k][camera.name] for k in chosen])
     try:
-        found, turn, shift = cv2.solvePnP(scale * points[chosen], pixels, camera.K, None, flags=cv2.SOLVEPNP_SQPNP)
+        solved, turn, shift = cv2.solvePnP(scale * points[chosen], pixels, camera.K, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:
         return None
-    if not found:
+    if not solved:
         return None
     back = camera.w2c[:3, :3].T
     return Stance(scale, back @ cv2.Rodrigues(turn)[0], back @ (shift.ravel() - camera.w2c[:3, 3]))

@@ -1,8 +1,8 @@
-"""Outlines of silhouettes to a fraction of a pixel: found, paired and compared.
+"""Outlines of silhouettes, to a fraction of a pixel.
 
-A silhouette is blurred a little and its outline taken at one half (marching squares), so that a jagged edge becomes
-the line about which it jumps. Rendered and segmented silhouettes go the same way, hence the blur favours neither.
-Where a silhouette is cut by the image's border it has no outline: the border is not the object's edge.
+A silhouette is blurred a little, and its outline taken at one half (marching squares). So a jagged edge becomes the
+line about which it jumps. Rendered and segmented silhouettes are treated alike, hence the blur favours neither. Where
+the image's border cuts a silhouette there is no outline: the border is not the object's edge.
 """
 
 from __future__ import annotations
@@ -14,23 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.prepare.arrays import Floats
-
-Array = Floats
+from splashbench.arrays import Floats
 
 # Pixels: standard deviation of the blur, and the strip along the image's border without an outline.
 _BLUR = 1.0
 _BORDER = 2.0
-# Points kept of one outline.
-_MOST_POINTS = 3000
+# Of one outline; of more, evenly spaced ones are taken.
+_MAX_POINTS = 3000
 
 
 @dataclass(frozen=True, eq=False)
 class Contour:
     """`points` [N, 2] in pixels (u, v; pixel centres at +0.5) with unit `normals` [N, 2] that point outwards."""
 
-    points: Array
-    normals: Array
+    points: Floats
+    normals: Floats
 
     @cached_property
     def tree(self) -> Any:
@@ -39,7 +37,7 @@ class Contour:
 
         return cKDTree(self.points)
 
-    def distances_to(self, other: Contour) -> Array:
+    def distances_to(self, other: Contour) -> Floats:
         """Distance [N] of each point to the other outline, pixels; inf where the other is empty."""
         if not len(other.points):
             return np.full(len(self.points), np.inf)
@@ -69,7 +67,7 @@ def find_contour(silhouette: NDArray) -> Contour:
     points = np.concatenate(pieces)[:, ::-1] + 0.5 if pieces else np.zeros((0, 2))
     inside = (points >= _BORDER).all(axis=1) & (points <= np.array([width, height]) - _BORDER).all(axis=1)
     points = points[inside]
-    points = points[:: max(1, -(-len(points) // _MOST_POINTS))]
+    points = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     # Sobel's gradient points into the silhouette.
     column, row = (points - 0.5).astype(np.float32).T
     gradient = np.stack(

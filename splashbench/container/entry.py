@@ -1,4 +1,4 @@
-"""A container's entry in a finished scene: the masks that show it, its file, what scene.json says, a picture of it."""
+"""A container's entry in a scene: the masks that show it, its file, what scene.json says, a picture of it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArr
     where fewer than two training cameras have a mask.
     """
     masked = masked or scene
-    found = {}
+    masks = {}
     for name in scene.cameras:
         mask = masked.container_mask(name) if name in masked.cameras else None
         if mask is None:
@@ -47,14 +47,14 @@ def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArr
                 f"{masked.directory}: camera {name} stands elsewhere than in {scene.directory}; give the same scene's"
                 " folder before it was cropped"
             )
-        found[name] = mask
-    training = sum(name in scene.train for name in found)
+        masks[name] = mask
+    training = sum(name in scene.train for name in masks)
     if training < 2:
         raise SplashbenchError(
             f"{masked.directory / 'container_mask'}: {training} of the training cameras {', '.join(scene.train)} has a"
             " container mask, two are needed; name the scene before it was cropped by --masks, or draw <camera>.png"
         )
-    return found, {name: masked.cameras[name] for name in found}
+    return masks, {name: masked.cameras[name] for name in masks}
 
 
 def doubtful(projections: Mapping[str, Projection]) -> list[str]:
@@ -72,24 +72,29 @@ def require_place(scene: Scene, replace: bool) -> None:
         raise SplashbenchError(f"{scene.directory / 'scene.json'} has a container already; --replace replaces it")
 
 
-def known_of(scene: Scene) -> SceneMeta:
+def stated_of(scene: Scene) -> SceneMeta:
     """What scene.json says, or an empty one."""
     return scene.meta or SceneMeta(name=plain_name(scene.name))
 
 
 def write_entry(
-    scene: Scene, name: str, put: Callable[[Path], Any], pose: ArrayLike, said: Mapping[str, Any]
+    scene: Scene, name: str, put: Callable[[Path], Any], pose: ArrayLike, facts: Mapping[str, Any]
 ) -> SceneMeta:
-    """Have `put` write the mesh's file, called `name`, and say in scene.json where it stands, and `said`.
+    """Have `put` write the mesh's file, called `name`, and say in scene.json where it stands, and the other `facts`.
 
     Returns what stands there; other fields stay. Both are written before either takes its place.
     """
     entry = {"container_mesh": name, "container_pose": np.asarray(pose, np.float64).tolist()}
-    meta = SceneMeta.model_validate({**known_of(scene).model_dump(), **entry, **said})
+    meta = SceneMeta.model_validate({**stated_of(scene).model_dump(), **entry, **facts})
     with files_together(scene.directory) as staging:
         put(staging / name)
         write_model(staging / "scene.json", meta)
     return meta
+
+
+def name_in_scene(mesh: Path) -> str:
+    """What the mesh's file is called in a scene's folder."""
+    return f"container{mesh.suffix.lower()}"
 
 
 def require_picture(path: Path | None) -> None:
@@ -103,17 +108,17 @@ def require_picture(path: Path | None) -> None:
 
 def picture(scene: Scene, mesh: ContainerMesh, pose: ArrayLike, width: int = 640) -> NDArray[np.uint8]:
     """The mesh's outline on the first image of every camera, RGB uint8 [H, W, 3], two cameras a row."""
-    shown = []
+    outlined = []
     for name, camera in scene.cameras.items():
         wide = min(width, camera.width)
-        shown.append(overlay(mesh, pose, camera, image=scene.image(name, 0), width=wide))
-    return in_pairs(shown)
+        outlined.append(overlay(mesh, pose, camera, image=scene.image(name, 0), width=wide))
+    return in_pairs(outlined)
 
 
-def in_pairs(shown: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def in_pairs(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Pictures RGB uint8 [H, W, 3] as one, two a row, with black where they are smaller than the largest."""
-    height, wide = max(image.shape[0] for image in shown), max(image.shape[1] for image in shown)
-    padded = [np.pad(image, ((0, height - image.shape[0]), (0, wide - image.shape[1]), (0, 0))) for image in shown]
+    height, wide = max(image.shape[0] for image in pictures), max(image.shape[1] for image in pictures)
+    padded = [np.pad(image, ((0, height - image.shape[0]), (0, wide - image.shape[1]), (0, 0))) for image in pictures]
     if len(padded) % 2:
         padded.append(np.zeros_like(padded[0]))
     return np.concatenate([np.concatenate(padded[i : i + 2], axis=1) for i in range(0, len(padded), 2)])

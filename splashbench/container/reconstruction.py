@@ -35,8 +35,8 @@ from splashbench.scene.container import ContainerMesh
 _CELLS = 128
 # Distances in front of a view's depth count up to so many cells.
 _FRONT = 1.5
-# So many cells behind it a view says that there is something: a wall thinner than that is thinned by the views of its
-# other side. Less leaves holes where the views' depths disagree.
+# Down to so many cells behind its depth, a view counts for a wall. A wall thinner than that is thinned by the views of
+# its other side. Less leaves holes where the views' depths disagree.
 _BEHIND = 11.0
 _SMOOTHING = 0.6
 # What a depth that no other view confirms counts beside one that is confirmed.
@@ -72,7 +72,7 @@ class Reconstruction:
     projections: dict[str, Projection]
 
 
-def write_reconstruction(scene: Scene, found: Reconstruction, replace: bool = False) -> Path:
+def write_reconstruction(scene: Scene, reconstruction: Reconstruction, replace: bool = False) -> Path:
     """Write the mesh into the scene's folder and name it in scene.json; returns its path. Other fields stay.
 
     replace: whether a container may be there already; an earlier reconstruction's file goes.
@@ -80,10 +80,12 @@ def write_reconstruction(scene: Scene, found: Reconstruction, replace: bool = Fa
     Raises SplashbenchError as `require_place` does.
     """
     require_place(scene, replace)
-    mesh = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces, process=False)
+    mesh = trimesh.Trimesh(reconstruction.mesh.vertices, reconstruction.mesh.faces, process=False)
     content = mesh.export(file_type="ply")
     name = _FILE.format(hashlib.sha256(content).hexdigest()[:8])
-    write_entry(scene, name, lambda path: path.write_bytes(content), found.pose, {"container_transparent": False})
+    write_entry(
+        scene, name, lambda path: path.write_bytes(content), reconstruction.pose, {"container_transparent": False}
+    )
     for path in scene.directory.glob(_FILE.format("*")):
         if path.name != name:
             path.unlink()
@@ -91,8 +93,8 @@ def write_reconstruction(scene: Scene, found: Reconstruction, replace: bool = Fa
 
 
 @dataclass(frozen=True)
-class _View:
-    """What one training view says: its container mask, of `mask_camera`, and the depth of its plate.
+class _PlateView:
+    """What one training view shows: its container mask, of `mask_camera`, and the depth of its plate.
 
     seen: bool [H, W], at the size of `depth`, what the plate shows.
     """
@@ -144,7 +146,7 @@ def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconst
     plates = [make_plate(training, name, SWEEP_SIDE) for name in track(training.train, "collecting what stands still")]
     maps = depth_maps(training.initial_points(), plates)
     views = [
-        _View(mask_cameras[name], masks[name], depth, plate.seen)
+        _PlateView(mask_cameras[name], masks[name], depth, plate.seen)
         for name, depth, plate in zip(training.train, maps, plates)
         if name in masks
     ]
@@ -161,10 +163,10 @@ def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconst
         raise SplashbenchError(f"{scene.directory}: the depths within the masks of {where} make no surface; {_REMEDY}")
     # As the file has it.
     mesh = ContainerMesh(mesh.vertices.astype(np.float32), mesh.faces)
-    shown = {name: _in_window(mask, mask_cameras[name], scene.cameras[name]) for name, mask in masks.items()}
+    windows = {name: _in_window(mask, mask_cameras[name], scene.cameras[name]) for name, mask in masks.items()}
     pose = np.eye(4)
     pose[:3, 3] = grid.origin
-    projections = verify(mesh, pose, [scene.cameras[name] for name in shown], shown)
+    projections = verify(mesh, pose, [scene.cameras[name] for name in windows], windows)
     overlap = float(np.median([projections[name].iou for name in masks if name in scene.train]))
     if overlap < _LEAST_COVER:
         raise SplashbenchError(
@@ -187,7 +189,7 @@ def _positions(camera: Camera) -> NDArray[np.float64]:
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
 
 
-def _surface(grid: Grid, views: list[_View]) -> ContainerMesh | None:
+def _surface(grid: Grid, views: list[_PlateView]) -> ContainerMesh | None:
     """The surface relative to the grid's origin, scene units; None where there is none."""
     field = np.stack([_fused(points, grid.voxel, views) for points in _slabs(grid)])
     field = ndimage.gaussian_filter(field, _SMOOTHING, mode="nearest")
@@ -210,7 +212,7 @@ def _slabs(grid: Grid) -> Iterator[NDArray[np.float64]]:
         yield grid.to_scene(plane + np.array([i, 0, 0]))
 
 
-def _fused(points: NDArray[np.float64], voxel: float, views: list[_View]) -> NDArray[np.float64]:
+def _fused(points: NDArray[np.float64], voxel: float, views: list[_PlateView]) -> NDArray[np.float64]:
     """The truncated signed distance at points [ny, nz, 3], in [-1, 1]: positive where it is free."""
     flat = points.reshape(-1, 3)
     total, weights = np.zeros(len(flat)), np.zeros(len(flat))
@@ -218,28 +220,30 @@ def _fused(points: NDArray[np.float64], voxel: float, views: list[_View]) -> NDA
     for view in views:
         within, beside = view.within(flat)
         distance, shown, confirmed = view.distances(flat)
-        speaks = within & (distance > -_BEHIND * voxel)
-        weight = np.where(confirmed, 1.0, _DOUBTED) * (speaks & shown)
+        counts = within & (distance > -_BEHIND * voxel)
+        weight = np.where(confirmed, 1.0, _DOUBTED) * (counts & shown)
         total += weight * np.clip(distance / (_FRONT * voxel), -1, 1)
         weights += weight
-        known |= speaks & confirmed
+        known |= counts & confirmed
         free |= beside
     known &= ~free
     return np.where(known, total / np.where(known, weights, 1), 1.0).reshape(points.shape[:2])
 
 
-def picture(scene: Scene, found: Reconstruction, width: int = 480) -> NDArray[np.uint8]:
+def picture(scene: Scene, reconstruction: Reconstruction, width: int = 480) -> NDArray[np.uint8]:
     """To judge by eye, a row per camera: the first image with the mesh's outline, the mesh lit from the camera.
 
     RGB uint8 [H, W, 3].
     """
-    placed = found.mesh.placed(found.pose)
-    shown = []
+    placed = reconstruction.mesh.placed(reconstruction.pose)
+    pictures = []
     for name, camera in scene.cameras.items():
         small = camera.scaled(min(1.0, width / camera.width))
-        shown.append(overlay(found.mesh, found.pose, camera, image=scene.image(name, 0), width=small.width))
-        shown.append(_lit(depth_image(placed, small), small))
-    return in_pairs(shown)
+        pictures.append(
+            overlay(reconstruction.mesh, reconstruction.pose, camera, image=scene.image(name, 0), width=small.width)
+        )
+        pictures.append(_lit(depth_image(placed, small), small))
+    return in_pairs(pictures)
 
 
 def _lit(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splashbench.container.alignment import Stance, camera_of_mesh
 from splashbench.container.contours import find_contour, intersection_over_union
+from splashbench.container.stance import Stance, camera_of_mesh
 from splashbench.observe.container import depth_image
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh

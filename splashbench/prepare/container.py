@@ -1,4 +1,4 @@
-"""The container of a session: its mesh placed by the training cameras' masks or by clicked points, and verified by all.
+"""The container stage: the session's mesh placed by the training cameras' masks or by clicked points.
 
 Held-out cameras decide nothing about a scene; their masks tell how well the mesh lies where nobody fitted it.
 """
@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splashbench.container.clicked_points import Click, place_by_points
+from splashbench.container.clicked_points import ClickedPoint, place_by_points
+from splashbench.container.entry import name_in_scene
 from splashbench.container.placement import Placement, place_by_silhouettes, up_from_container
 from splashbench.container.verification import Projection, verify
 from splashbench.errors import SplashbenchError
@@ -21,13 +22,14 @@ from splashbench.prepare.masks.provider import Mask, read_raw_mask
 from splashbench.prepare.poses.metric import GRAVITY
 from splashbench.prepare.poses.scale import Upright
 from splashbench.prepare.session import DESCRIPTION, Session
+from splashbench.prepare.stage_cache import StageStore, facts_of
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
 
 @dataclass(frozen=True)
 class PlacedContainer:
-    """The placement, and how each camera that has a mask sees it: training cameras decided, held-out ones did not."""
+    """The placement, and how each camera that has a mask sees it, held-out ones too."""
 
     placement: Placement
     projections: dict[str, Projection]
@@ -36,22 +38,22 @@ class PlacedContainer:
 def container_masks(folder: Path | None, undistorters: Mapping[str, Undistorter]) -> dict[str, Mask]:
     """Undistorted, uncropped container masks from FOLDER/<camera>.png in raw geometry; cameras without one are left
     out."""
-    found: dict[str, Mask] = {}
+    masks: dict[str, Mask] = {}
     if folder is None:
-        return found
+        return masks
     for camera, undistorter in undistorters.items():
         path = folder / f"{camera}.png"
         if path.is_file():
-            found[camera] = undistorter.mask(read_raw_mask(path, undistorter.lens.width, undistorter.lens.height))
-    return found
+            masks[camera] = undistorter.mask(read_raw_mask(path, undistorter.lens.width, undistorter.lens.height))
+    return masks
 
 
 def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
     """Raise SplashbenchError for a container mask of another size than the recording's (width, height), for clicks
     outside the frames, and where no training camera has a mask and there are no clicks."""
-    described, folder = session.container, session.container_folder
-    assert described is not None
-    for number, click in enumerate(described.points, 1):
+    table, folder = session.container, session.container_folder
+    assert table is not None
+    for number, click in enumerate(table.points, 1):
         for camera, (u, v) in click.pixels.items():
             width, height = sizes[camera]
             if not (0 <= u <= width and 0 <= v <= height):
@@ -59,16 +61,42 @@ def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
                     f"{session.directory / DESCRIPTION}: [container] point {number} lies at ({u:g}, {v:g}) in camera"
                     f" {camera}, whose frames are {width}x{height}; give pixels of the raw frame"
                 )
-    found = []
+    masked = []
     for camera in session.cameras if folder is not None else ():
         path = Path(folder or "") / f"{camera}.png"
         if path.is_file():
             read_raw_mask(path, *sizes[camera])
-            found.append(camera)
-    if not described.points and not any(camera in session.train for camera in found):
+            masked.append(camera)
+    if not table.points and not any(camera in session.train for camera in masked):
         raise SplashbenchError(
             f"{folder}: no mask of a training camera, named <camera>.png; give some, or points under [container]"
         )
+
+
+def container_stage(
+    store: StageStore,
+    session: Session,
+    mesh: ContainerMesh | None,
+    cameras: Mapping[str, Camera],
+    masks: Mapping[str, Mask],
+    undistorters: Mapping[str, Undistorter],
+) -> PlacedContainer | None:
+    """The container's mesh in the scene, placed as `place_container` does; None where the session has none."""
+    if mesh is None:
+        return None
+    inputs = {
+        "files": facts_of(container_files(session)),
+        "described": session.container,
+        "train": session.train,
+        "cameras": {name: [camera.K, camera.w2c] for name, camera in cameras.items()},
+        "lenses": {name: undistorter.lens for name, undistorter in undistorters.items()},
+    }
+    return store.result(
+        "container",
+        PlacedContainer,
+        inputs,
+        lambda: place_container(session, mesh, list(cameras.values()), masks, undistorters),
+    )
 
 
 def place_container(
@@ -96,27 +124,27 @@ def _place(
     gravity: tuple[float, float, float] | None,
     metres_per_unit: float | None,
 ) -> Placement:
-    described = session.container
-    assert described is not None
+    table = session.container
+    assert table is not None
     training = [camera for camera in cameras if camera.name in session.train]
-    seen = {camera.name: masks[camera.name] for camera in training if camera.name in masks}
+    training_masks = {camera.name: masks[camera.name] for camera in training if camera.name in masks}
     placement: Placement | None = None
-    if described.points:
+    if table.points:
         placement = place_by_points(
             mesh,
             training,
-            [Click(click.point, _pinhole_pixels(click.pixels, undistorters)) for click in described.points],
-            up=described.up or "y",
+            [ClickedPoint(click.point, _pinhole_pixels(click.pixels, undistorters)) for click in table.points],
+            up=table.up or "y",
             metres_per_unit=metres_per_unit,
-            masks=seen,
+            masks=training_masks,
             source=f"{session.directory / DESCRIPTION}: [container] points",
         )
-    if seen:
+    if training_masks:
         placement = place_by_silhouettes(
             mesh,
             training,
-            seen,
-            up=described.up,
+            training_masks,
+            up=table.up,
             metres_per_unit=metres_per_unit,
             gravity=gravity,
             initial=None if placement is None else placement.pose,
@@ -135,30 +163,25 @@ def upright_container(
 ) -> Upright:
     """Which way is up, and the metres, from the container in a reconstruction without either: for a session that has
     neither a flat board nor a marker. `cameras` in structure from motion's own frame."""
-    described = session.container
-    assert described is not None
+    table = session.container
+    assert table is not None
     placement = _place(session, mesh, cameras, masks, undistorters, gravity=None, metres_per_unit=None)
-    # Structure from motion's units per unit of the mesh were found; the mesh's own metres are known, or not.
-    known = None if described.scale is None else described.scale / placement.scale
-    return Upright(np.asarray(up_from_container(placement)), placement.pose[:3, 3], known)
+    # The placement tells structure from motion's units per unit of the mesh; the mesh's metres may be unknown.
+    metres_per_unit = None if table.scale is None else table.scale / placement.scale
+    return Upright(np.asarray(up_from_container(placement)), placement.pose[:3, 3], metres_per_unit)
 
 
 def _pinhole_pixels(
     pixels: Mapping[str, tuple[float, float]], undistorters: Mapping[str, Undistorter]
 ) -> dict[str, tuple[float, float]]:
     """Pixels clicked in raw frames, in the undistorted ones."""
-    moved = {}
+    undistorted = {}
     for camera, pixel in pixels.items():
         lens = undistorters[camera].lens
         ray = np.append(lens.normalise(np.array([pixel], np.float64))[0], 1.0)
         u, v, _ = lens.K @ ray
-        moved[camera] = (float(u), float(v))
-    return moved
-
-
-def name_in_scene(mesh: Path) -> str:
-    """What the mesh's file is called in a scene's folder."""
-    return f"container{mesh.suffix.lower()}"
+        undistorted[camera] = (float(u), float(v))
+    return undistorted
 
 
 def put_into_scene(session: Session, directory: Path) -> None:

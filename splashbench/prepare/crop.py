@@ -3,11 +3,13 @@
 "Each camera is cropped to a window fixed in size and position: the union of its mask bounding boxes over all frames
 and both splits, padded by 96 px and rounded up to a multiple of eight. Only the principal point is shifted."
 
-What the paper leaves open is decided here. The padded box is cut at the image's border. Rounding up adds pixels at
-the right and the bottom; where these lie outside the image the window moves left or up instead. Where the image
-itself is narrower than the rounded size, the window is the largest multiple of eight that fits the image, as centred
-on the padded box as the image allows while holding the whole mask; and where the mask alone needs more than that, it
-is the image's full extent, the one case in which a side is not a multiple of eight.
+What the paper leaves open is decided here:
+- The padded box is cut at the image's border.
+- Rounding up adds pixels at the right and the bottom. Where these lie outside the image, the window moves left or up.
+- Where the image is narrower than the rounded size, the window is the largest multiple of eight that fits the image. It
+  holds the whole mask, and is as centred on the padded box as the image then allows.
+- Where the mask needs more than that, the window is the image's full extent: the one case in which a side is not a
+  multiple of eight.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ MULTIPLE = 8
 
 
 @dataclass(frozen=True)
-class Box:
+class PixelBox:
     """Pixels x0 <= column < x1, y0 <= row < y1."""
 
     x0: int
@@ -40,30 +42,30 @@ class Box:
         """Rows in the box."""
         return self.y1 - self.y0
 
-    def union(self, other: Box | None) -> Box:
+    def union(self, other: PixelBox | None) -> PixelBox:
         """The smallest box that holds both; `other` may be None, the box of an empty mask."""
         if other is None:
             return self
-        return Box(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
+        return PixelBox(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
 
     def cut(self, image: NDArray) -> NDArray:
         """The part of an image [H, W, ...] inside the box."""
         return image[self.y0 : self.y1, self.x0 : self.x1]
 
 
-def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
+def bounding_box(mask: NDArray[np.bool_]) -> PixelBox | None:
     """The box around a mask [H, W]; None where it is empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None
-    return Box(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    return PixelBox(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
 
 
-def crop_window(union: Box, width: int, height: int, padding: int = PADDING, multiple: int = MULTIPLE) -> Box:
+def crop_window(union: PixelBox, width: int, height: int, padding: int = PADDING, multiple: int = MULTIPLE) -> PixelBox:
     """The crop for the union of mask boxes in images of `width` x `height` pixels."""
     x0, x1 = _window(union.x0, union.x1, width, padding, multiple)
     y0, y1 = _window(union.y0, union.y1, height, padding, multiple)
-    return Box(x0, y0, x1, y1)
+    return PixelBox(x0, y0, x1, y1)
 
 
 def _window(low: int, high: int, extent: int, padding: int, multiple: int) -> tuple[int, int]:

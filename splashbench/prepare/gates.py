@@ -1,7 +1,7 @@
-"""Pass marks of a preparation: figures that tell a sound scene from one that merely was computed.
+"""Gates of a preparation: figures that tell a sound scene from one that merely was computed.
 
-An essential gate that fails stops `prepare`; any other is a warning, kept in the report. Limits follow from what the
-figure does to a scene, or from what the paper's own captures reach, and stand beside the value in the report.
+An essential gate that fails stops `prepare`; any other is a warning in the report. Limits follow from what the figure
+does to a scene, or from what the paper's captures reach. They stand beside the value in the report.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ HALF_FRAME_S = 0.5 / 60
 
 @dataclass(frozen=True)
 class Gate:
-    """One pass mark. `value` is None where the figure could not be had, which fails."""
+    """One figure and its limit. `value` is None where the figure could not be had, which fails."""
 
     name: str
     value: float | None
@@ -90,11 +90,11 @@ def intrinsics_gates(calibrations: Mapping[str, Calibration]) -> list[Gate]:
 
 def sync_gates(clocks: Mapping[str, ClockFit], sequence: SequenceSync | None) -> list[Gate]:
     """Every clock found, their scatter, and the paper's residual synchronisation error of the sequence."""
-    found = sum(fit.status == "ok" for fit in clocks.values())
+    n_found = sum(fit.status == "ok" for fit in clocks.values())
     scatter = {camera: fit.residual_rms_s for camera, fit in clocks.items()}
     worst = max(scatter, key=scatter.__getitem__)
     gates = [
-        Gate("cameras_synchronised", found, len(clocks), "at least", f"of {len(clocks)} cameras", essential=True),
+        Gate("cameras_synchronised", n_found, len(clocks), "at least", f"of {len(clocks)} cameras", essential=True),
         Gate(
             "clock_residual", scatter[worst], 1e-3, "at most", f"s RMS of the windows about the clock, camera {worst}"
         ),
@@ -152,7 +152,7 @@ def metric_gates(frame: SceneFrame) -> list[Gate]:
     if frame.scale_disagreement is not None:
         detail = f"share, largest difference between {', '.join(frame.scales)}"
         gates.append(Gate("scale_agreement", frame.scale_disagreement, 0.01, "at most", detail))
-        remedy = "measure them again, and mend or leave out the wrong one in session.toml"
+        remedy = "measure them again, and correct or leave out the wrong one in session.toml"
         gates.append(Gate("scale_is_one", frame.scale_disagreement, 0.1, "at most", detail, True, remedy))
     return gates
 
@@ -167,10 +167,10 @@ def mask_gates(health: Mapping[str, MaskHealth], n_frames: int) -> list[Gate]:
     """Masks that cannot be right, and masks without liquid."""
     failed = sum(len(h.failed) for h in health.values())
     empty = max(len(h.empty) for h in health.values()) / n_frames
-    most = max(health, key=lambda camera: len(health[camera].empty))
+    emptiest = max(health, key=lambda camera: len(health[camera].empty))
     return [
         Gate("masks_failed", failed, 0, "at most", "flooded or flickering masks over all cameras"),
-        Gate("masks_empty", empty, 0.2, "at most", f"share of empty masks, camera {most}"),
+        Gate("masks_empty", empty, 0.2, "at most", f"share of empty masks, camera {emptiest}"),
     ]
 
 
@@ -186,10 +186,10 @@ def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -
         gates.append(
             Gate("container_iou", overlap, 0.95, "at least", "projected mesh and mask, median of training views")
         )
-        beyond, remedy = "as above; below it, it is another mesh", "check mesh, masks and metres_per_unit"
-        gates.append(Gate("container_is_the_container", overlap, 0.8, "at least", beyond, True, remedy))
-        known = {camera: seen[camera].contour_median_px for camera in fitted}
-        medians = {camera: np.inf if found is None else found for camera, found in known.items()}
+        detail_of_limit, remedy = "as above; below it, it is another mesh", "check mesh, masks and metres_per_unit"
+        gates.append(Gate("container_is_the_container", overlap, 0.8, "at least", detail_of_limit, True, remedy))
+        medians_px = {camera: seen[camera].contour_median_px for camera in fitted}
+        medians = {camera: np.inf if median is None else median for camera, median in medians_px.items()}
         worst = max(fitted, key=medians.__getitem__)
         detail = f"px between projected and masked outline, median, camera {worst}"
         gates.append(Gate("container_outline", medians[worst], max(1.5, width / 1000), "at most", detail))

@@ -1,4 +1,4 @@
-"""Everything that preparing one session found out, as prepare_report.json tells it."""
+"""The outcome of preparing one session, as prepare_report.json tells it."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splashbench.prepare.audio.clocks import Listening, SoundPaths
+from splashbench.prepare.audio.clocks import SoundPaths, SyncResult
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.container import PlacedContainer
-from splashbench.prepare.crop import Box
+from splashbench.prepare.crop import PixelBox
 from splashbench.prepare.gates import Gate
-from splashbench.prepare.masks.provider import MaskHealth
-from splashbench.prepare.masks.sheet import Faults, SheetCell
+from splashbench.prepare.masks.production import MaskRecord
 from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.poses.structure_from_motion import Poses
+from splashbench.prepare.scene_output import ReportPictures
 from splashbench.prepare.session import Session
 from splashbench.prepare.stage_cache import Stage, StageRecord
 from splashbench.prepare.video.motion import MotionInterval
@@ -29,24 +28,18 @@ SCHEMA_VERSION = 1
 
 
 @dataclass(frozen=True)
-class MaskRecord:
-    """The masks as written: areas in pixels of the undistorted, uncropped frames, [T] per camera."""
-
-    provider: str
-    areas: dict[str, list[int]]
-    health: dict[str, MaskHealth]
-    faults: Faults
-
-
-@dataclass(frozen=True)
 class Preparation:
-    """The outcome of every stage. `poses` is in the scene frame; `clocks` are `heard.clocks`, corrected for the sound's
-    travel where its source is given. `stages`, how long each took, is no part of the reports: those tell of the scene
-    alone, and are the same however often a preparation was interrupted.
+    """The outcome of every stage.
+
+    Attributes:
+        poses: in the scene's frame.
+        clocks: `synced.clocks`, corrected for the sound's travel where its source is given.
+        stages: how long each took. No part of the reports: those tell of the scene alone, and are the same however
+            often a preparation was interrupted.
     """
 
     session: Session
-    heard: Listening
+    synced: SyncResult
     calibrations: dict[str, Calibration]
     clocks: dict[str, ClockFit]
     sound_paths: SoundPaths
@@ -57,12 +50,11 @@ class Preparation:
     sampling: Sampling
     masks: MaskRecord
     container: PlacedContainer | None
-    windows: dict[str, Box]
+    windows: dict[str, PixelBox]
     cropped: bool
     gates: list[Gate]
     stages: dict[Stage, StageRecord]
-    sheet: dict[str, list[SheetCell]] = field(default_factory=dict, repr=False)
-    overlays: dict[str, NDArray[np.uint8]] = field(default_factory=dict, repr=False)
+    pictures: ReportPictures = field(default_factory=ReportPictures, repr=False)
 
     @property
     def warnings(self) -> list[Gate]:
@@ -77,7 +69,7 @@ class Preparation:
             "session": self.session.name,
             "reference": self.session.reference,
             "sync": {camera: self._sync(camera) for camera in self.clocks},
-            "recordings": {camera: _recording(facts) for camera, facts in self.heard.facts.items()},
+            "recordings": {camera: _recording(video) for camera, video in self.synced.videos.items()},
             "sound_paths": {
                 "source": list(self.sound_paths.source),
                 "applied": self.sound_paths.applied,
@@ -125,7 +117,7 @@ class Preparation:
                 "times": self.sampling.times.tolist(),
                 "nominal": self.sampling.nominal.tolist(),
                 "camera_times": {camera: times.tolist() for camera, times in self.sampling.camera_times.items()},
-                "source_frames": {camera: found.tolist() for camera, found in self.sampling.indices.items()},
+                "source_frames": {camera: frames.tolist() for camera, frames in self.sampling.indices.items()},
                 "largest_spread_s": float(self.sampling.spread_s.max()),
             },
             "masks": {
@@ -153,21 +145,21 @@ class Preparation:
             "residual_rms_s": fit.residual_rms_s,
             "windows": fit.n_windows,
             "status": fit.status,
-            "seams": [{"time_s": seam.time_s, "gap_s": seam.gap_s} for seam in self.heard.seams[camera]],
+            "seams": [{"time_s": seam.time_s, "gap_s": seam.gap_s} for seam in self.synced.seams[camera]],
             "sequence_offset_s": self.sequence.offsets_s.get(camera),
         }
 
 
-def _recording(facts: VideoInfo) -> dict[str, Any]:
+def _recording(video: VideoInfo) -> dict[str, Any]:
     return {
-        "width": facts.width,
-        "height": facts.height,
-        "fps": facts.fps,
-        "frames": facts.n_frames,
-        "seconds": facts.duration,
-        "codec": facts.codec,
-        "timecode": facts.timecode,
-        "audio_minus_video_s": facts.audio_minus_video_s,
+        "width": video.width,
+        "height": video.height,
+        "fps": video.fps,
+        "frames": video.n_frames,
+        "seconds": video.duration,
+        "codec": video.codec,
+        "timecode": video.timecode,
+        "audio_minus_video_s": video.audio_minus_video_s,
     }
 
 

@@ -1,9 +1,9 @@
-"""What the stages of a preparation found, kept on disk so that no work is done twice.
+"""The results of a preparation's stages, cached on disk so that no work is done twice.
 
 A result is stored with a key: the SHA-256 of everything that it was made from, files by their name, size and time of
-modification. The next run takes a result whose key is still the same, and makes the others anew; so does a run after
-one that was killed, since a result appears whole (written beside its place, then renamed) or not at all. A stage that
-leaves files fills a folder whose result is written last: without it the folder is rubbish, and is made anew.
+modification. The next run takes a result whose key is still the same, and makes the others anew. So does a run after
+one that was killed: a result appears whole (written beside its place, then renamed) or not at all. A stage that leaves
+files fills a folder, and its result is written last. A folder without its result is rubbish, and is made anew.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from splashbench.arrays import plain
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path
-from splashbench.prepare.arrays import plain
 from splashbench.version import __version__
 
 Stage = Literal["sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene"]
+FileFacts = tuple[str, int, int]  # name, bytes, nanoseconds of modification
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
 # Results depend on these as much as on the recordings.
@@ -116,13 +117,13 @@ class StageStore:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
         start = time.perf_counter()
-        made = make()
+        result = make()
         seconds = time.perf_counter() - start
         self._count(stage, seconds)
-        content = {"key": key, "seconds": round(seconds, 3), "files": _sizes(folder), "result": _plain(made)}
+        content = {"key": key, "seconds": round(seconds, 3), "files": _sizes(folder), "result": _plain(result)}
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(content))
-        return made
+        return result
 
     def _count(self, stage: Stage, seconds: float) -> None:
         record = self.records.setdefault(stage, StageRecord())
@@ -134,14 +135,19 @@ class StageStore:
         return self.folder / stage / f"{part}.json" if part else self.folder / f"{stage}.json"
 
     def _key(self, stage: Stage, part: str, inputs: Mapping[str, Any]) -> str:
-        made_from = {"stage": stage, "part": part, "splashbench": __version__, **self._versions, "inputs": inputs}
-        return hashlib.sha256(json.dumps(_plain(made_from), sort_keys=True).encode()).hexdigest()
+        origin = {"stage": stage, "part": part, "splashbench": __version__, **self._versions, "inputs": inputs}
+        return hashlib.sha256(json.dumps(_plain(origin), sort_keys=True).encode()).hexdigest()
 
 
 def _code_digest() -> str:
-    """SHA-256 of this package's source: a version alone does not tell an edited checkout from what it was."""
+    """SHA-256 of the source that makes results: a version alone does not tell an edited checkout from what it was.
+
+    That is `prepare`, the container's room, and the modules that all rooms share.
+    """
+    package = Path(__file__).parents[1]
+    files = [*package.glob("*.py"), *(package / "prepare").rglob("*.py"), *(package / "container").rglob("*.py")]
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(files):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
@@ -189,8 +195,8 @@ def _sizes(folder: Path | None) -> dict[str, int]:
     return {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
 
 
-def facts_of(paths: Iterable[Path]) -> list[tuple[str, int, int]]:
-    """What tells files from their earlier selves: (name, bytes, nanoseconds of modification) of each.
+def facts_of(paths: Iterable[Path]) -> list[FileFacts]:
+    """The facts that tell files from their earlier selves.
 
     A folder stands for the files directly in it.
     """

@@ -1,1 +1,1 @@
-"""Made-up recordings and scenes with exact ground truth, and what a preparation made of them."""
+"""Synthetic recordings and scenes with exact ground truth, and the verification of scenes prepared from them."""

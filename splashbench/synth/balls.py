@@ -1,4 +1,4 @@
-"""A made-up scene in a second: blue balls in ballistic flight over a patterned floor, with exact ground truth.
+"""A synthetic scene in a second: blue balls in ballistic flight over a patterned floor, with exact ground truth.
 
 No simulation and no ray-tracing library: silhouettes, times, gravity and particles are analytic, so every figure a
 test wants is known. It is for trying a new method (CONTRIBUTING.md) and for the tests, not for benchmarking.

@@ -18,14 +18,14 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
 from splashbench.synth.imaging.geometry import Mesh, bowl_mesh, tank_mesh
-from splashbench.synth.imaging.rendering import Stage, View
+from splashbench.synth.imaging.lens import LensCamera
+from splashbench.synth.imaging.rendering import RoomView, TracedRoom
 from splashbench.synth.imaging.room import Room, pour_room, tank_room
 from splashbench.synth.liquid import simulation
 from splashbench.synth.liquid.simulation import Pour
 from splashbench.synth.liquid.surface import liquid_surface
 from splashbench.synth.liquid.trajectory import Trajectory
-from splashbench.synth.recording.lens import LensCamera
-from splashbench.synth.recording.plan import CAMERAS, GRAVITY, TEST, TRAIN, Options, make_plan
+from splashbench.synth.recording.plan import CAMERAS, GRAVITY, TEST, TRAIN, RecordingOptions, make_plan
 from splashbench.synth.recording.session import write_ply
 from splashbench.synth.recording.video import SensorNoise
 
@@ -37,7 +37,7 @@ _AFTER_SECONDS = 0.02
 
 
 @dataclass(frozen=True)
-class Container:
+class SynthContainer:
     """What the liquid is poured into: its closed mesh, the room it stands in (given the seed), and if it is clear."""
 
     mesh: Callable[[], Mesh]
@@ -45,8 +45,8 @@ class Container:
     transparent: bool
 
 
-BOWL = Container(bowl_mesh, pour_room, transparent=False)
-TANK = Container(tank_mesh, tank_room, transparent=True)
+BOWL = SynthContainer(bowl_mesh, pour_room, transparent=False)
+TANK = SynthContainer(tank_mesh, tank_room, transparent=True)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Recipe:
     pour: Pour
     start: float
     steps_ms: tuple[float, ...]
-    container: Container = BOWL
+    container: SynthContainer = BOWL
 
     def times(self, timesteps: int, step_ms: float | None = None) -> NDArray[np.float64]:
         """Instants [timesteps] in seconds of the simulation; `step_ms` replaces the recipe's own steps."""
@@ -128,7 +128,7 @@ def make_scene(
     Raises SplashbenchError for an unknown name, for frames that last too long, or when the liquid solver cannot run.
     """
     if name not in RECIPES:
-        raise SplashbenchError(f"there is no made-up scene {name!r}; choose one of {', '.join(RECIPES)}")
+        raise SplashbenchError(f"there is no synthetic scene {name!r}; choose one of {', '.join(RECIPES)}")
     if timesteps < 2:
         raise SplashbenchError(f"--timesteps {timesteps} will not do; give 2 or more")
     if step_ms is not None and not 0 < step_ms < np.inf:
@@ -141,7 +141,7 @@ def make_scene(
             f"{_LONGEST_SECONDS:.0f} s; give fewer --timesteps or a smaller --step"
         )
     radius = recipe.pour.particle_radius if particle_radius is None else particle_radius
-    options = Options(size=size, seed=seed, particle_radius=radius)
+    options = RecordingOptions(size=size, seed=seed, particle_radius=radius)
     plan = make_plan(options)
     pour = replace(
         recipe.pour,
@@ -159,15 +159,15 @@ def make_scene(
             trajectory = running.finish()
         finally:
             running.stop()
-        stage = Stage(recipe.container.room(seed))
-        views = {camera: View(stage, lens, samples=1) for camera, lens in lenses.items()}
+        room = TracedRoom(recipe.container.room(seed))
+        views = {camera: RoomView(room, lens, samples=1) for camera, lens in lenses.items()}
         write_scene(
             staging,
             cameras={camera: Camera(camera, *size, lens.K, lens.w2c) for camera, lens in lenses.items()},
             train=TRAIN,
             test=TEST,
             n_frames=timesteps,
-            frames=_frames(stage, lenses, trajectory, shown, pour.particle_radius, seed),
+            frames=_frames(room, lenses, trajectory, shown, pour.particle_radius, seed),
             meta=SceneMeta(
                 name=f"synthetic_{name}",
                 times=(shown - shown[0]).tolist(),
@@ -198,7 +198,7 @@ def _pinhole(camera: LensCamera) -> LensCamera:
 
 
 def _frames(
-    stage: Stage,
+    room: TracedRoom,
     lenses: dict[str, LensCamera],
     trajectory: Trajectory,
     shown: NDArray[np.float64],
@@ -210,14 +210,14 @@ def _frames(
         positions, _, active = trajectory.at(float(time))
         surfaces.append(liquid_surface(positions[active], particle_radius))
     for k, (camera, lens) in enumerate(lenses.items()):
-        view = View(stage, lens)
+        view = RoomView(room, lens)
         noise = SensorNoise(lens.width, lens.height, (seed, 30, k))
         for t, surface in enumerate(surfaces):
             frame = view.with_liquid(surface)
             yield camera, t, noise.expose(frame.image), frame.mask
 
 
-def _initial_points(views: list[View], seed: int) -> NDArray[np.float32]:
+def _initial_points(views: list[RoomView], seed: int) -> NDArray[np.float32]:
     """Points of the room [N, 7] that the training views see: x, y, z, r, g, b, and 0 for "not liquid"."""
     rng = np.random.default_rng([seed, 31])
     gathered = []

@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from splashbench import toml
-from splashbench.container.clicked_points import Click, place_by_points
+from splashbench.container.clicked_points import ClickedPoint, place_by_points
 from splashbench.container.contours import find_contour
 from splashbench.container.placement import Placement, place_by_silhouettes, up_from_container
 from splashbench.container.verification import overlay, silhouette, verify
@@ -233,12 +233,12 @@ def test_unusable_masks_are_one_line(change: Callable[[Masks], None], message: s
 CORNERS = np.array([[x, y, z] for x in (-0.15, 0.15) for y in (0, 0.12) for z in (-0.08, 0.08)])
 
 
-def clicks(truth: np.ndarray, cameras: list[Camera], corners: np.ndarray = CORNERS) -> list[Click]:
+def clicks(truth: np.ndarray, cameras: list[Camera], corners: np.ndarray = CORNERS) -> list[ClickedPoint]:
     """The corners of the tank, clicked to about half a pixel."""
     rng = np.random.default_rng(1)
     placed = corners @ truth[:3, :3].T + truth[:3, 3]
     return [
-        Click(
+        ClickedPoint(
             tuple(corner.tolist()),
             {camera.name: tuple(camera.project(place[None])[0][0] + rng.normal(0, 0.5, 2)) for camera in cameras},
         )

@@ -1,18 +1,39 @@
-"""Pass marks: which side passes, what stops a preparation, and what only warns."""
+"""Gates: which side passes, what stops a preparation, and what only warns."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from splashbench.alignment import Similarity
+from splashbench.container.placement import Placement
+from splashbench.container.verification import Projection
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
+from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.gates import Gate, mask_gates, pixel_limit, pose_gates, require, source_gate, sync_gates
+from splashbench.prepare.container import PlacedContainer
+from splashbench.prepare.gates import (
+    Gate,
+    container_gates,
+    intrinsics_gates,
+    mask_gates,
+    metric_gates,
+    pixel_limit,
+    pose_gates,
+    require,
+    sampling_gates,
+    source_gate,
+    sync_gates,
+)
 from splashbench.prepare.masks.provider import mask_health
+from splashbench.prepare.poses.metric import MetricFrame
+from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.poses.structure_from_motion import Poses
+from splashbench.prepare.video.sampling import Sampling
 
 
 @pytest.mark.parametrize(
@@ -80,7 +101,7 @@ def test_pose_gates_count_cameras_and_sweep() -> None:
     assert found["cameras_posed"].essential
     assert found["mean_reprojection"].passed
     assert found["track_length"].value == 5.0
-    assert not found["sweep_registered"].passed
+    assert not found["sweep_registered"].passed  # 4 of 10 frames, half is needed
 
 
 def test_mask_gates_report_the_camera_with_most_empty_masks() -> None:
@@ -91,3 +112,101 @@ def test_mask_gates_report_the_camera_with_most_empty_masks() -> None:
     assert empty.value == 0.75
     assert "camera 2" in empty.detail
     assert not source_gate({"1": 1.0, "2": 0.97}).passed
+
+
+def calibration(focal_sigma: float = 0.4, coverage: float = 0.9, held_out: float = 0.3) -> Calibration:
+    lens = Lens(480, 270, np.diag([400.0, 400.0, 1.0]), np.zeros(5))
+    return Calibration(lens, 0.2, held_out, focal_sigma, coverage, 150, 100, 0, 0, 50, np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize(
+    ("worse", "gate"),
+    [
+        ({"focal_sigma": 2.4}, "focal_sigma"),  # 0.6% of the focal length
+        ({"coverage": 0.5}, "board_coverage"),
+        ({"held_out": 0.6}, "held_out_reprojection"),
+    ],
+)
+def test_intrinsics_gates_judge_the_worst_camera(worse: dict[str, float], gate: str) -> None:
+    gates = intrinsics_gates({"1": calibration(), "2": calibration(**worse), "3": calibration()})
+    assert [failed.name for failed in gates if not failed.passed] == [gate]
+    assert all(found.detail.endswith("camera 2") for found in gates if found.name == gate)
+    assert all(found.passed for found in intrinsics_gates({"1": calibration()}))
+
+
+def metric_frame(rms: float, scales: dict[str, float], scale_sigma: float = 5e-4) -> SceneFrame:
+    similarity = Similarity(1.0, np.eye(3), np.zeros(3))
+    board = MetricFrame(similarity, rms, 28, 9, 0.3, np.zeros((28, 3)), scale_sigma)
+    return SceneFrame(similarity, "board", "board", scales, {"board": scale_sigma}, board)
+
+
+@pytest.mark.parametrize(
+    ("frame", "failed", "stops"),
+    [
+        (metric_frame(1e-3, {"board": 1.0}), [], False),
+        (metric_frame(3e-3, {"board": 1.0}), ["board_residual"], False),
+        (metric_frame(3e-2, {"board": 1.0}), ["board_residual", "board_is_a_board"], True),
+        (metric_frame(1e-3, {"board": 1.0}, 2e-3), ["scale_sigma"], False),
+        (metric_frame(1e-3, {"board": 1.0, "distance": 0.97}), ["scale_agreement"], False),
+        (metric_frame(1e-3, {"board": 1.0, "distance": 0.8}), ["scale_agreement", "scale_is_one"], True),
+    ],
+)
+def test_metric_gates_warn_of_doubts_and_stop_at_nonsense(frame: SceneFrame, failed: list[str], stops: bool) -> None:
+    gates = metric_gates(frame)
+    assert [gate.name for gate in gates if not gate.passed] == failed
+    assert any(gate.essential and not gate.passed for gate in gates) is stops
+
+
+def test_sampling_gate_counts_frames_of_all_cameras() -> None:
+    flags = {"1": np.array([True, False]), "2": np.array([True, True])}
+    (gate,) = sampling_gates(Sampling(np.arange(2.0), np.arange(2.0), {}, {}, flags))
+    assert (gate.value, gate.passed) == (3, False)
+
+
+def placed(ious: dict[str, float], median_px: float | None = 0.5, **changes) -> PlacedContainer:
+    placement = Placement(
+        pose=np.eye(4),
+        scale=1.0,
+        up_axis="y",
+        up=np.array([0.0, 1.0, 0.0]),
+        up_is_ambiguous=False,
+        turn="free",
+        equivalent_turns=0,
+        cameras=("1", "2", "3"),
+        projections={},
+        position_sigma=1e-3,
+    )
+    return PlacedContainer(
+        replace(placement, **changes), {name: Projection(iou, median_px, median_px) for name, iou in ious.items()}
+    )
+
+
+GOOD = {"1": 0.98, "2": 0.97, "3": 0.99, "6": 0.96, "7": 0.95}
+
+
+@pytest.mark.parametrize(
+    ("container", "failed"),
+    [
+        (placed(GOOD), []),
+        (placed(GOOD | {"1": 0.2}), []),  # a hand before one training camera
+        (placed(GOOD | {"1": 0.94, "2": 0.9}), ["container_iou"]),
+        (placed(GOOD | {"1": 0.6, "2": 0.7}), ["container_iou", "container_is_the_container"]),
+        (placed(GOOD | {"6": 0.85}), ["container_held_out"]),
+        (placed(GOOD, 4.0), ["container_outline"]),
+        (placed(GOOD, None), ["container_outline"]),
+        (placed(GOOD, position_sigma=3e-3), ["container_sigma"]),
+        (placed(GOOD, point_rms_px={"1": 2.0, "2": 6.0}), ["container_clicks"]),
+        (placed({"6": 0.95}, point_rms_px={"1": 60.0}), ["container_clicks", "container_clicks_fit"]),
+        (placed(GOOD, up=np.array([0.1, 1.0, 0.0])), ["container_upright"]),
+    ],
+)
+def test_container_gates(container: PlacedContainer, failed: list[str]) -> None:
+    gates = container_gates(container, ["1", "2", "3"], 1920)
+    assert [gate.name for gate in gates if not gate.passed] == failed
+
+
+def test_only_another_container_or_senseless_clicks_stop() -> None:
+    other = container_gates(placed(dict.fromkeys(GOOD, 0.5)), ["1", "2", "3"], 1920)
+    assert [gate.name for gate in other if gate.essential and not gate.passed] == ["container_is_the_container"]
+    senseless = container_gates(placed({}, point_rms_px={"1": 60.0}), ["1"], 1920)
+    assert [gate.name for gate in senseless if gate.essential and not gate.passed] == ["container_clicks_fit"]

@@ -1,4 +1,4 @@
-"""All of `splashbench prepare`: unusable recordings each give one line and no scene, a made-up session gives a scene.
+"""All of `splashbench prepare`: unusable recordings each give one line and no scene, a synthetic session gives a scene.
 
 The clips here are tiny and show a moving square over a shared noise: enough for the clocks and the motion, not for a
 lens.
@@ -20,7 +20,7 @@ from splashbench import toml
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
-from splashbench.prepare.pipeline import Options, prepare
+from splashbench.prepare.pipeline import PrepareOptions, prepare
 
 WIDTH, HEIGHT, FPS, RATE = 128, 72, 30, 48000
 CAMERAS = ("1", "2", "3")
@@ -105,7 +105,7 @@ def edit(session: Path, **changes) -> None:
     (session / "session.toml").write_text(toml.dumps(description))
 
 
-def fails(session: Path, pattern: str, options: Options | None = None) -> None:
+def fails(session: Path, pattern: str, options: PrepareOptions | None = None) -> None:
     scene = session.parent / "scene"
     with pytest.raises(SplashbenchError, match=pattern) as caught:
         prepare(session, scene, options)
@@ -213,10 +213,10 @@ def test_an_existing_scene_is_kept_unless_told_otherwise(session: Path) -> None:
     with pytest.raises(SplashbenchError, match="exists already"):
         prepare(session, scene)
     with pytest.raises(SplashbenchError, match="no earlier output"):
-        prepare(session, scene, Options(replace=True))
+        prepare(session, scene, PrepareOptions(replace=True))
     (scene / "train_meta.json").touch()
     with pytest.raises(SplashbenchError, match="ChArUco"):
-        prepare(session, scene, Options(replace=True))
+        prepare(session, scene, PrepareOptions(replace=True))
     assert (scene / "notes.txt").read_text() == "mine"
 
 
@@ -238,19 +238,19 @@ def test_command_line_exit_statuses(session: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.fixture(scope="module")
-def made_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A made-up session with exact ground truth, smaller than the default."""
-    directory = tmp_path_factory.mktemp("made_up") / "session"
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic session with exact ground truth, smaller than the default."""
+    directory = tmp_path_factory.mktemp("synthetic") / "session"
     assert main(["synth", "session", str(directory), "--fps", "30", "--particle-radius", "0.004"]) == 0
     return directory
 
 
 @pytest.mark.slow
-def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
+def test_a_synthetic_session_becomes_a_scene(synthetic: Path, tmp_path: Path) -> None:
     from splashbench.scene import Scene
 
     out = tmp_path / "scene"
-    preparation = prepare(made_up, out, Options(timesteps=20))
+    preparation = prepare(synthetic, out, PrepareOptions(timesteps=20))
     assert [gate.name for gate in preparation.warnings] == []
     scene = Scene.open(out)
     assert scene.n_frames == 20
@@ -263,7 +263,7 @@ def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
         assert scene.image(camera.name, 10).shape == (camera.height, camera.width, 3)
         assert scene.mask(camera.name, 10).any()
 
-    truth = json.loads((made_up / "truth/truth.json").read_text())
+    truth = json.loads((synthetic / "truth/truth.json").read_text())
     report = json.loads((out / "prepare_report.json").read_text())
     for camera, known in truth["cameras"].items():
         focal = np.array(report["intrinsics"][camera]["K"])[[0, 1], [0, 1]]
@@ -286,17 +286,17 @@ def test_made_up_session_becomes_a_scene(made_up: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_only_what_changed_is_done_again(made_up: Path, tmp_path: Path) -> None:
-    session = Path(shutil.copytree(made_up, tmp_path / "session"))
+def test_only_what_changed_is_done_again(synthetic: Path, tmp_path: Path) -> None:
+    session = Path(shutil.copytree(synthetic, tmp_path / "session"))
     shutil.rmtree(session / "prepare", ignore_errors=True)  # of other tests
-    options = Options(timesteps=5)
+    options = PrepareOptions(timesteps=5)
     first = prepare(session, tmp_path / "first", options)
     again = prepare(session, tmp_path / "again", options)
     assert [stage for stage, record in first.stages.items() if record.reused] == []
     assert [stage for stage, record in again.stages.items() if not record.reused] == ["scene"]
     assert contents(tmp_path / "again") == contents(tmp_path / "first")
 
-    masks = prepare(session, tmp_path / "masks", Options(timesteps=5, again_from="masks"))
+    masks = prepare(session, tmp_path / "masks", PrepareOptions(timesteps=5, again_from="masks"))
     assert [stage for stage, record in masks.stages.items() if not record.reused] == ["masks", "scene"]
     assert contents(tmp_path / "masks") == contents(tmp_path / "first")
 
@@ -328,13 +328,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_folder_of_masks_whole_frames_and_a_given_interval(made_up: Path, tmp_path: Path) -> None:
+def test_a_folder_of_masks_whole_frames_and_a_given_interval(synthetic: Path, tmp_path: Path) -> None:
     from splashbench.scene import Scene
 
-    options = Options(
-        masks=str(made_up / "truth/masks"), timesteps=5, interval=(2.2, 3.0), crop=False, image_format="jpg"
+    options = PrepareOptions(
+        masks=str(synthetic / "truth/masks"), timesteps=5, interval=(2.2, 3.0), crop=False, image_format="jpg"
     )
-    prepare(made_up, tmp_path / "scene", options)
+    prepare(synthetic, tmp_path / "scene", options)
     scene = Scene.open(tmp_path / "scene")
     assert {(camera.width, camera.height) for camera in scene.cameras.values()} == {(480, 270)}
     assert (tmp_path / "scene/ims/1/000004.jpg").is_file()
@@ -342,8 +342,8 @@ def test_a_folder_of_masks_whole_frames_and_a_given_interval(made_up: Path, tmp_
 
 
 @pytest.mark.slow
-def test_a_camera_that_cannot_be_posed_is_named(made_up: Path, tmp_path: Path) -> None:
-    session = Path(shutil.copytree(made_up, tmp_path / "session"))
+def test_a_camera_that_cannot_be_posed_is_named(synthetic: Path, tmp_path: Path) -> None:
+    session = Path(shutil.copytree(synthetic, tmp_path / "session"))
     static = toml.load(session / "session.toml")["recordings"]["static"]["4"][0]
     write_clip(session / static, seconds=0.5, size=(480, 270))  # something else altogether
     fails(session, "no pose for camera 4;")

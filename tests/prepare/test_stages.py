@@ -18,16 +18,17 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from splashbench.alignment import Similarity
 from splashbench.cli import prepare as cli_prepare
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.audio.clocks import Listening
+from splashbench.prepare.audio.clocks import SyncResult
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.board import BoardView
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.masks.production import CameraMasks
-from splashbench.prepare.poses.metric import MetricFrame, Sighting, Similarity
+from splashbench.prepare.poses.metric import MetricFrame, Sighting
 from splashbench.prepare.poses.rig import PosedRig
 from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.stage_cache import STAGES, StageStore, facts_of, open_stages
@@ -62,7 +63,7 @@ CLOCK = ClockFit(1 / 3, 1 - 49e-6, float("inf"), 1e-5, 2, "ok", ((0.1, -1e-5), (
 FLAGGED = ClockFit(float("nan"), float("nan"), 1.2, float("nan"), 0, "unrelated")
 RESULTS = [
     (dict[str, ClockFit], {"1": CLOCK, "2": FLAGGED}),
-    (Listening, Listening({"1": CLOCK}, {"1": ()}, {})),
+    (SyncResult, SyncResult({"1": CLOCK}, {"1": ()}, {})),
     (SequenceSync, SequenceSync(None, {}, ("2", "3"))),
     (MotionInterval, MotionInterval(0.1, 2.7, ("given",), {"1": (0.1, 2.7)})),
     (
@@ -90,7 +91,7 @@ RESULTS = [
 @pytest.mark.parametrize(
     "kind",
     [
-        Listening,
+        SyncResult,
         MotionInterval,
         SequenceSync,
         Sampling,

@@ -1,4 +1,4 @@
-"""A small made-up session, made once for all tests that look at one."""
+"""A small synthetic session, made once for all tests that look at one."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from splashbench.synth.recording.plan import Options
+from splashbench.synth.recording.plan import RecordingOptions
 
-SMALL = Options(size=(128, 72), fps=20, seed=3, duration=0.7, particle_radius=0.005)
+SMALL = RecordingOptions(size=(128, 72), fps=20, seed=3, duration=0.7, particle_radius=0.005)
 
 
 @pytest.fixture(scope="session")

@@ -21,10 +21,10 @@ from splashbench.synth.imaging.geometry import (
     tank_mesh,
 )
 from splashbench.synth.imaging.glass import ABSORPTION, Glass
+from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.raycast import FAR, Tracer
-from splashbench.synth.imaging.rendering import Stage, View, thickness
+from splashbench.synth.imaging.rendering import RoomView, TracedRoom, thickness
 from splashbench.synth.imaging.room import Room, tank_room
-from splashbench.synth.recording.lens import LensCamera
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,13 @@ def camera() -> LensCamera:
 
 
 @pytest.fixture(scope="module")
-def through(room: Room, camera: LensCamera) -> View:
-    return View(Stage(room), camera)
+def through(room: Room, camera: LensCamera) -> RoomView:
+    return RoomView(TracedRoom(room), camera)
 
 
 @pytest.fixture(scope="module")
-def bare(room: Room, camera: LensCamera) -> View:
-    return View(Stage(replace(room, glass=None)), camera)
+def bare(room: Room, camera: LensCamera) -> RoomView:
+    return RoomView(TracedRoom(replace(room, glass=None)), camera)
 
 
 def ball(centre: tuple[float, float, float], radius: float) -> Mesh:
@@ -122,16 +122,16 @@ def test_a_ray_that_misses_the_tank_is_left_alone() -> None:
     assert np.array_equal(panes.through(light, 0.0, FAR), light)
 
 
-def test_masks_through_the_glass_are_masks_without_it(through: View, bare: View, room: Room) -> None:
+def test_masks_through_the_glass_are_masks_without_it(through: RoomView, bare: RoomView, room: Room) -> None:
     mask = through.with_liquid(LIQUID).mask
     assert mask.sum() > 200
     assert np.array_equal(mask, bare.with_liquid(LIQUID).mask)
     clay = np.full((len(tank_mesh().vertices), 3), 0.5, np.float32)
-    opaque = View(Stage(Room(room.quads, tank_mesh(), clay)), through.camera).with_liquid(LIQUID)
+    opaque = RoomView(TracedRoom(Room(room.quads, tank_mesh(), clay)), through.camera).with_liquid(LIQUID)
     assert opaque.mask.sum() < 0.8 * mask.sum()
 
 
-def test_the_glass_is_seen_before_the_room_and_before_the_liquid(through: View, bare: View) -> None:
+def test_the_glass_is_seen_before_the_room_and_before_the_liquid(through: RoomView, bare: RoomView) -> None:
     tank = through.container_mask
     difference = np.abs(through.image - bare.image).max(axis=2)
     assert np.median(difference[tank]) > 0.02
@@ -144,10 +144,13 @@ def test_the_glass_is_seen_before_the_room_and_before_the_liquid(through: View, 
     assert (np.abs(seen.image - plain.image).max(axis=2)[behind] > 0.004).all()
 
 
-def test_liquid_before_the_tank_is_not_seen_through_it(through: View, bare: View, camera: LensCamera) -> None:
+def test_liquid_before_the_tank_is_not_seen_through_it(through: RoomView, bare: RoomView, camera: LensCamera) -> None:
     near = np.array(LOOK_AT) + 0.5 * (camera.center - LOOK_AT)
     drop = ball((float(near[0]), float(near[1]), float(near[2])), 0.01)
-    opaque = [View(Stage(replace(v.stage.room, clear_liquid=False)), camera).with_liquid(drop) for v in (through, bare)]
+    opaque = [
+        RoomView(TracedRoom(replace(v.traced.room, clear_liquid=False)), camera).with_liquid(drop)
+        for v in (through, bare)
+    ]
     inner = opaque[0].mask & (np.abs(opaque[0].image - through.image).max(axis=2) > 0.05)
     inner &= through.container_mask
     whole = inner & np.roll(inner, 1, 0) & np.roll(inner, -1, 0) & np.roll(inner, 1, 1) & np.roll(inner, -1, 1)

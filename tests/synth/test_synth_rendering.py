@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("embreex")
 
 from splashbench.synth.imaging.geometry import LOOK_AT, Mesh, Quad, arc_point, bowl_mesh, look_at, revolve
-from splashbench.synth.imaging.rendering import Stage, View
+from splashbench.synth.imaging.lens import LensCamera, distort, undistort
+from splashbench.synth.imaging.rendering import RoomView, TracedRoom
 from splashbench.synth.imaging.room import Room
-from splashbench.synth.recording.lens import LensCamera, distort, undistort
 
 DISTORTION = np.array([-0.13, 0.04, 5e-4, -6e-4, 0.0])
 
@@ -22,16 +22,16 @@ def camera() -> LensCamera:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
+def room() -> TracedRoom:
     grey = np.full((8, 8, 3), 0.4, np.float32)
     table = Quad(np.array([-2.0, 0, -2]), np.array([4.0, 0, 0]), np.array([0, 0, 4.0]), grey)
     bowl = bowl_mesh()
-    return Stage(Room([table], bowl, np.full((len(bowl.vertices), 3), 0.6, np.float32)))
+    return TracedRoom(Room([table], bowl, np.full((len(bowl.vertices), 3), 0.6, np.float32)))
 
 
 @pytest.fixture(scope="module")
-def view(stage: Stage, camera: LensCamera) -> View:
-    return View(stage, camera)
+def view(room: TracedRoom, camera: LensCamera) -> RoomView:
+    return RoomView(room, camera)
 
 
 def ball(centre: np.ndarray, radius: float) -> Mesh:
@@ -59,7 +59,7 @@ def test_projection_agrees_with_opencv(camera: LensCamera) -> None:
 
 @pytest.mark.parametrize("centre", [(-0.22, 0.22, -0.1), (0.24, 0.05, 0.1), (0.0, 0.2, 0.0)])
 def test_a_ball_is_seen_where_the_distorted_lens_projects_it(
-    view: View, camera: LensCamera, centre: tuple[float, float, float]
+    view: RoomView, camera: LensCamera, centre: tuple[float, float, float]
 ) -> None:
     place = np.array(centre)
     mask = view.with_liquid(ball(place, 0.006)).mask
@@ -70,20 +70,20 @@ def test_a_ball_is_seen_where_the_distorted_lens_projects_it(
     assert mask.sum() == pytest.approx(np.pi * (0.006 * 470 / depth) ** 2, rel=0.25)
 
 
-def test_the_lens_matters_away_from_the_centre(view: View, camera: LensCamera) -> None:
+def test_the_lens_matters_away_from_the_centre(view: RoomView, camera: LensCamera) -> None:
     """The test above could not tell a pinhole from a lens if the two agreed."""
     place = np.array([[-0.22, 0.22, -0.1]])
     pinhole = LensCamera(camera.width, camera.height, camera.K, np.zeros(5), camera.w2c)
     assert np.linalg.norm(pinhole.project(place)[0] - camera.project(place)[0]) > 1.0
 
 
-def test_liquid_behind_the_bowl_is_not_in_the_mask(view: View, camera: LensCamera) -> None:
+def test_liquid_behind_the_bowl_is_not_in_the_mask(view: RoomView, camera: LensCamera) -> None:
     behind = np.array([0.0, 0.03, 0.0]) - 0.15 * (camera.center - LOOK_AT) * np.array([1, 0, 1])
     assert not view.with_liquid(ball(behind, 0.004)).mask.any()
     assert view.with_liquid(ball(behind + np.array([0, 0.2, 0]), 0.004)).mask.any()
 
 
-def test_only_the_liquid_and_its_shadow_change_the_image(view: View, camera: LensCamera) -> None:
+def test_only_the_liquid_and_its_shadow_change_the_image(view: RoomView, camera: LensCamera) -> None:
     frame = view.with_liquid(ball(np.array([-0.2, 0.15, 0.0]), 0.01))
     changed = np.abs(frame.image - view.image).max(axis=2) > 0
     assert (changed | ~frame.mask).all(), "every liquid pixel differs from the room"
@@ -93,7 +93,7 @@ def test_only_the_liquid_and_its_shadow_change_the_image(view: View, camera: Len
     assert view.with_liquid(None).image is view.image
 
 
-def test_the_container_mask_covers_the_bowl_and_nothing_else(view: View, camera: LensCamera) -> None:
+def test_the_container_mask_covers_the_bowl_and_nothing_else(view: RoomView, camera: LensCamera) -> None:
     uv, _ = camera.project(bowl_mesh().vertices.astype(np.float64))
     rows, columns = np.nonzero(view.container_mask)
     assert columns.min() == pytest.approx(uv[:, 0].min(), abs=1)

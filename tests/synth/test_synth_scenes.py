@@ -1,4 +1,4 @@
-"""A made-up scene is a whole scene, and its particles lie in its masks."""
+"""A synthetic scene is a whole scene, and its particles lie in its masks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from splashbench.cli import synth as command
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
-from splashbench.synth.recording.plan import Options, make_plan
+from splashbench.synth.recording.plan import RecordingOptions, make_plan
 from splashbench.synth.scenes import RECIPES, make_scene
 
 
@@ -114,7 +114,7 @@ def test_liquid_in_the_tank_is_in_the_masks(tank: Scene) -> None:
 def test_no_camera_sees_where_liquid_comes_from(name: str, size: tuple[int, int]) -> None:
     if RECIPES[name].pour.emit_until < RECIPES[name].start:
         return  # it has all come before the first frame
-    plan = make_plan(Options(size=size))
+    plan = make_plan(RecordingOptions(size=size))
     pour = replace(RECIPES[name].pour, azimuth_degrees=plan.pour.azimuth_degrees)
     nozzle, _ = pour.placed()
     for recorder in plan.recorders.values():

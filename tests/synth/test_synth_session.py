@@ -1,4 +1,4 @@
-"""A made-up session is complete, readable by `prepare`, and agrees with its own truth."""
+"""A synthetic session is complete, readable by `prepare`, and agrees with its own truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray
 from splashbench.prepare.session import Session
 from splashbench.synth.recording.audio import SAMPLE_RATE, SPEED_OF_SOUND, clap, interpolate
-from splashbench.synth.recording.plan import CAMERAS, CHAPTERED, Options, make_plan
+from splashbench.synth.recording.plan import CAMERAS, CHAPTERED, RecordingOptions, make_plan
 from splashbench.synth.recording.session import make_session
 from splashbench.synth.recording.truth import Truth
 
@@ -64,7 +64,9 @@ def test_every_listed_file_is_there_and_decodes(small_session: Path) -> None:
 def test_chapters_join_without_a_gap(small_session: Path) -> None:
     chapters = recording(small_session, CHAPTERED)
     assert [file.name for file in chapters] == ["GX010003.MP4", "GX020003.MP4"]
-    recorder = make_plan(Options(size=(128, 72), fps=20, seed=3, duration=0.7, particle_radius=0.005)).recorders["3"]
+    recorder = make_plan(
+        RecordingOptions(size=(128, 72), fps=20, seed=3, duration=0.7, particle_radius=0.005)
+    ).recorders["3"]
     counts = []
     for file in chapters:
         with av.open(str(file)) as container:
@@ -150,7 +152,7 @@ def test_a_frame_of_the_board_shows_the_board(small_session: Path) -> None:
 
 def test_the_same_seed_decides_the_same_and_another_does_not() -> None:
     def digest(seed: int) -> str:
-        plan = make_plan(Options(seed=seed))
+        plan = make_plan(RecordingOptions(seed=seed))
         return json.dumps(
             [[r.start_s, r.clock_rate, r.camera.K.tolist(), r.camera.w2c.tolist()] for r in plan.recorders.values()]
             + [plan.pour.azimuth_degrees, plan.sources[1].samples[:100].tolist()]
@@ -161,7 +163,7 @@ def test_the_same_seed_decides_the_same_and_another_does_not() -> None:
 
 
 def test_clocks_differ_as_real_ones_do() -> None:
-    recorders = make_plan(Options()).recorders
+    recorders = make_plan(RecordingOptions()).recorders
     assert (recorders["1"].start_s, recorders["1"].clock_rate) == (0.0, 1.0)
     assert recorders["4"].clock_rate == pytest.approx(1 - 49e-6)
     assert recorders["7"].clock_rate == pytest.approx(1 - 81e-6)
@@ -174,7 +176,7 @@ def test_an_existing_folder_is_kept(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "precious").touch()
     with pytest.raises(SplashbenchError, match="exists already"):
-        make_session(tmp_path / "mine", Options())
+        make_session(tmp_path / "mine", RecordingOptions())
     assert (tmp_path / "mine" / "precious").exists()
 
 
@@ -217,7 +219,7 @@ def test_the_default_session_can_be_calibrated(tmp_path: Path) -> None:
     from splashbench.synth.imaging.texture import charuco_board
     from splashbench.synth.recording.plan import BOARD
 
-    session = make_session(tmp_path / "session", Options())
+    session = make_session(tmp_path / "session", RecordingOptions())
     facts = Truth(session).file.cameras
     board = charuco_board(BOARD)
     detector = cv2.aruco.CharucoDetector(board)

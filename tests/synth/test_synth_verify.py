@@ -15,9 +15,9 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray, write_json
 from splashbench.scene import Camera, Scene, SceneMeta, write_scene
-from splashbench.synth.recording.lens import distort
+from splashbench.synth.imaging.lens import distort
 from splashbench.synth.recording.truth import Truth
-from splashbench.synth.recording.verification import align, verify_scene
+from splashbench.synth.recording.verification import verify_scene
 
 SCALE = 7.0  # scene units per metre
 TURN = Rotation.from_euler("xyz", [0.3, -0.8, 0.5]).as_matrix()
@@ -143,17 +143,6 @@ def test_the_clock_is_judged_relative_to_the_reference_of_the_preparation(small_
     assert found.cameras["2"].sync_error_ms == pytest.approx(0, abs=1e-9)
     assert found.cameras["1"].sync_error_ms == pytest.approx(0, abs=1e-6)
     assert found.cameras["3"].sync_error_ms == pytest.approx(4.0, abs=1e-3)
-
-
-def test_align_recovers_a_similarity_and_never_mirrors() -> None:
-    points = np.random.default_rng(0).normal(size=(7, 3))
-    found = align(points, to_scene(points))
-    assert found.scale == pytest.approx(SCALE)
-    assert np.allclose(found.rotation, TURN)
-    assert np.allclose(found.shift, SHIFT)
-    assert np.allclose(found.to_scene(found.to_world(points)), points)
-    mirrored = align(points, points * np.array([1, 1, -1]))
-    assert np.linalg.det(mirrored.rotation) == pytest.approx(1.0)
 
 
 def test_the_command_prints_json_and_writes_a_file(

@@ -12,7 +12,7 @@ from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, say
 
 if TYPE_CHECKING:
-    from splashbench.container.released_scene import ReleasedPlacement
+    from splashbench.container.scene_placement import ScenePlacement
     from splashbench.scene.layout import SceneMeta
 
 # Beyond these, what scene.json said and what the container says of gravity and scale are told apart.
@@ -68,7 +68,7 @@ def register(actions: argparse._SubParsersAction) -> None:
 def place_container(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene place-container`."""
     from splashbench.container.entry import doubtful, picture, require_picture
-    from splashbench.container.released_scene import place_in_scene, require_container_place, write_placement
+    from splashbench.container.scene_placement import place_in_scene, require_container_place, write_placement
     from splashbench.files import write_png
     from splashbench.scene import Scene
     from splashbench.scene.container import read_mesh
@@ -112,7 +112,7 @@ def place_container(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _say_what_is_doubtful(found: ReleasedPlacement, doubted: list[str], meta: SceneMeta) -> None:
+def _say_what_is_doubtful(found: ScenePlacement, doubted: list[str], meta: SceneMeta) -> None:
     placement = found.placement
     if doubted:
         say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")

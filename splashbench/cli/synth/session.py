@@ -49,10 +49,10 @@ def register(actions: argparse._SubParsersAction) -> None:
 
 def film(arguments: argparse.Namespace) -> int:
     """Handle `splashbench synth session`."""
-    from splashbench.synth.recording.plan import Options
+    from splashbench.synth.recording.plan import RecordingOptions
     from splashbench.synth.recording.session import make_session
 
-    options = Options(
+    options = RecordingOptions(
         size=arguments.size,
         fps=arguments.fps,
         seed=arguments.seed,

@@ -1,4 +1,4 @@
-"""The pour as recorded: what the files say about themselves, and the cameras' clocks from their sound."""
+"""The sync stage: clocks from the sound of the pour, corrected for the sound's travel, checked on the sequence."""
 
 from __future__ import annotations
 
@@ -8,54 +8,84 @@ from dataclasses import dataclass
 from splashbench.prepare.audio import sync
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.audio.waveform import Seam
+from splashbench.prepare.session import Session
+from splashbench.prepare.stage_cache import StageStore
+from splashbench.prepare.video.pour import PourRecordings
 from splashbench.prepare.video.recording import Recording, VideoInfo
 from splashbench.progress import track
+from splashbench.scene.camera import Camera
 
 AUDIO_RATE = 48000
 
 
 @dataclass(frozen=True)
-class Listening:
-    """By camera: `clocks` by arrival of the sound, `seams` where its sound is interrupted, `facts` of its recording."""
+class SyncResult:
+    """By camera: `clocks` by arrival of the sound, `seams` where the sound is interrupted, `videos` by the files."""
 
     clocks: dict[str, ClockFit]
     seams: dict[str, tuple[Seam, ...]]
-    facts: dict[str, VideoInfo]
+    videos: dict[str, VideoInfo]
 
 
-def listen(pour: Mapping[str, Recording], reference: str) -> Listening:
-    """Read the sound of every camera's recording and fit its clock to the reference's.
+def sync_stage(store: StageStore, pour: PourRecordings, reference: str) -> SyncResult:
+    """Every camera's clock against the reference's.
 
     Raises SplashbenchError naming the file of the first camera whose sound gives no clock.
     """
+    inputs = {"files": pour.all_files, "reference": reference}
+    return store.result("sync", SyncResult, inputs, lambda: _find_clocks(pour.recordings, reference))
+
+
+def _find_clocks(pour: Mapping[str, Recording], reference: str) -> SyncResult:
     tracks = {name: recording.audio_track(AUDIO_RATE) for name, recording in track(pour.items(), "reading sound")}
-    audio = {name: (found.samples, found.start_s) for name, found in tracks.items()}
+    audio = {name: (sound.samples, sound.start_s) for name, sound in tracks.items()}
     clocks = sync.estimate_sync(audio, AUDIO_RATE, reference)
     sync.require_synced(clocks, {name: recording.paths[0] for name, recording in pour.items()})
-    return Listening(
+    return SyncResult(
         clocks,
-        {name: found.seams for name, found in tracks.items()},
+        {name: sound.seams for name, sound in tracks.items()},
         {name: recording.info for name, recording in pour.items()},
     )
 
 
-def left_over(
-    pour: Mapping[str, Recording], clocks: Mapping[str, ClockFit], interval: tuple[float, float], reference: str
+def sequence_sync(
+    store: StageStore,
+    pour: PourRecordings,
+    clocks: Mapping[str, ClockFit],
+    interval: tuple[float, float],
+    reference: str,
 ) -> SequenceSync:
     """The paper's residual synchronisation error within `interval` (seconds, reference clock)."""
-    audio = {name: recording.audio(AUDIO_RATE) for name, recording in pour.items()}
-    return sync.sequence_sync_rms(audio, AUDIO_RATE, clocks, interval, reference)
+
+    def measure() -> SequenceSync:
+        audio = {name: recording.audio(AUDIO_RATE) for name, recording in pour.recordings.items()}
+        return sync.sequence_sync_rms(audio, AUDIO_RATE, clocks, interval, reference)
+
+    inputs = {"files": pour.all_files, "clocks": clocks, "interval": interval}
+    return store.result("motion", SequenceSync, inputs, measure, part="sequence_sync")
 
 
 @dataclass(frozen=True)
 class SoundPaths:
-    """How the sound's travel shifts the clocks: `source` [3] metres in the scene, `given` or taken as its origin.
+    """How the sound's travel shifts the clocks.
 
-    `distance_m` and `shift_s` by camera: from source to camera, and what is added to its clock's start. `applied`:
-    whether the clocks were corrected by it; without a given source it is only what one at the origin would do.
+    Attributes:
+        source: [3], metres in the scene; its origin where session.toml gives none.
+        applied: whether the clocks were corrected. Without a given source the figures below are only what one at the
+            origin would do.
+        distance_m: camera -> metres from the source.
+        shift_s: camera -> seconds added to its clock's start.
     """
 
     source: tuple[float, float, float]
     applied: bool
     distance_m: dict[str, float]
     shift_s: dict[str, float]
+
+
+def sound_paths(session: Session, cameras: Mapping[str, Camera]) -> SoundPaths:
+    """What the sound's travel does to the clocks, once the cameras' places are known."""
+    source = session.sound.source if session.sound else (0.0, 0.0, 0.0)
+    positions = {name: camera.center for name, camera in cameras.items()}
+    distance, shift = sync.sound_paths(positions, source, session.reference)
+    return SoundPaths(source, session.sound is not None, distance, shift)

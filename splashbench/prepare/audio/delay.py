@@ -90,20 +90,20 @@ def _envelope(samples: Samples, rate: int) -> Floats:
 def _peaks(correlation: Floats, negative: int, count: int, apart: int) -> list[int]:
     """Lags of the highest values of a circular correlation; the last `negative` entries are negative lags."""
     c = correlation.copy()
-    found = []
+    lags = []
     for _ in range(count):
         k = int(np.argmax(c))
-        found.append(k if k < len(c) - negative else k - len(c))
+        lags.append(k if k < len(c) - negative else k - len(c))
         c[np.arange(k - apart, k + apart + 1) % len(c)] = -np.inf
-    return found
+    return lags
 
 
 def _distinct(lags: list[float], apart: float) -> list[float]:
-    kept: list[float] = []
+    distinct: list[float] = []
     for lag in lags:
-        if all(abs(lag - other) > apart for other in kept):
-            kept.append(lag)
-    return kept
+        if all(abs(lag - other) > apart for other in distinct):
+            distinct.append(lag)
+    return distinct
 
 
 def measure(
@@ -114,28 +114,28 @@ def measure(
     reach: float,
     seconds: float,
     block: int = 0,
-    most: int = 200,
+    max_windows: int = 200,
 ) -> list[Window]:
     """Delays in windows of `seconds` over the overlap of x and y, each within `reach` seconds of the line's prediction.
 
     `block`: samples per transform (a power of two); 0 chooses one that the reach fits into. Where windows
-    overlapping by half would be more than `most`, the loudest of each stretch is taken.
+    overlapping by half would be more than `max_windows`, the loudest of each stretch is taken.
     """
     start, clock = line
     begin = max(0.0, -start / clock)
     end = min(len(y) / rate, (len(x) / rate - start) / clock)
     count = max(1, int(2 * (end - begin) / seconds - 1))
     middles = np.linspace(begin + seconds / 2, end - seconds / 2, count) if count > 1 else np.array([(begin + end) / 2])
-    if count > most:
+    if count > max_windows:
         tenth = rate // 10
         power = np.square(y[: len(y) // tenth * tenth]).reshape(-1, tenth).sum(axis=1, dtype=np.float64)
         total = np.concatenate([[0.0], np.cumsum(power)])
         edges = np.clip(((middles[:, None] + [-seconds / 2, seconds / 2]) * 10).astype(int), 0, len(power))
         loudness = total[edges[:, 1]] - total[edges[:, 0]]
-        stretches = np.array_split(np.arange(count), most)
+        stretches = np.array_split(np.arange(count), max_windows)
         middles = middles[[stretch[int(np.argmax(loudness[stretch]))] for stretch in stretches]]
-    found = (measure_span(x, y, rate, line, reach, (t - seconds / 2, t + seconds / 2), block) for t in middles)
-    return [window for window in found if window is not None]
+    windows = (measure_span(x, y, rate, line, reach, (t - seconds / 2, t + seconds / 2), block) for t in middles)
+    return [window for window in windows if window is not None]
 
 
 def measure_span(
@@ -204,9 +204,9 @@ def _correlate(
     first = round(max(0.0, span[0]) * rate)
     places = np.arange(first, min(round(span[1] * rate), len(y)) - block + 1, hop)
     exact = (start + clock * places / rate) * rate
-    whole = np.round(exact).astype(np.int64)
-    inside = (whole >= 0) & (whole + block <= len(x))
-    places, exact, whole = places[inside], exact[inside], whole[inside]
+    rounded = np.round(exact).astype(np.int64)
+    inside = (rounded >= 0) & (rounded + block <= len(x))
+    places, exact, rounded = places[inside], exact[inside], rounded[inside]
     if not len(places):
         return None
     frequencies = np.arange(block // 2 + 1) / block  # cycles per sample
@@ -214,26 +214,26 @@ def _correlate(
     cross = np.zeros(len(frequencies), np.complex128)
     power_x, power_y = np.zeros(len(frequencies)), np.zeros(len(frequencies))
     steps = np.arange(block)
-    used = 0
+    n_used = 0
     for chunk in np.array_split(np.arange(len(places)), max(1, len(places) // 64)):
-        blocks_x = x[whole[chunk, None] + steps] * taper
+        blocks_x = x[rounded[chunk, None] + steps] * taper
         blocks_y = y[places[chunk, None] + steps] * taper
         fx, fy = fft.rfft(blocks_x), fft.rfft(blocks_y)
         px, py = (np.square(f.real) + np.square(f.imag) for f in (fx, fy))
         # Every block counts alike: one loud block must not drown the rest in the spectrum it does not have.
         level = np.sqrt(px.mean(axis=1) * py.mean(axis=1)) + 1e-12
-        used += int((level > 1e-11).sum())
+        n_used += int((level > 1e-11).sum())
         # At most a quarter turn: single precision is ample.
-        shift = np.exp((2j * np.pi * frequencies * (exact - whole)[chunk, None]).astype(np.complex64))
+        shift = np.exp((2j * np.pi * frequencies * (exact - rounded)[chunk, None]).astype(np.complex64))
         cross += np.einsum("bf,bf,bf,b->f", fx, np.conj(fy), shift, 1 / level)
         power_x += (px / (px.mean(axis=1)[:, None] + 1e-12)).sum(axis=0)
         power_y += (py / (py.mean(axis=1)[:, None] + 1e-12)).sum(axis=0)
-    if not used:
+    if not n_used:
         return None
     size = np.abs(cross)
     # Magnitude-squared coherence, less what that many blocks of unrelated noise would show.
     coherence = size**2 / np.maximum(power_x * power_y, 1e-20)
-    weight = np.clip(coherence - 1.0 / used, 0, 1) if used > 3 else np.ones_like(coherence)
+    weight = np.clip(coherence - 1.0 / n_used, 0, 1) if n_used > 3 else np.ones_like(coherence)
     band = (frequencies * rate >= _LOWEST_HZ) & (frequencies * rate <= min(_HIGHEST_HZ, 0.45 * rate))
     weighted = np.where(band & (size > 0), weight * cross / np.maximum(size, 1e-20), 0)
     padded = np.zeros(block * _UPSAMPLING // 2 + 1, np.complex128)

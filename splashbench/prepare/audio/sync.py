@@ -6,15 +6,14 @@ windows' delays is the clock:
 
     t_reference = start_s + clock_rate * t_local.
 
-How far a rate can be known: a short recording cannot tell drift from a sound source that moved. Path
-differences between microphones change by some centimetres when the loudest source changes, `PATH_SD_S` in
-seconds, so windows that spread over `spread` seconds know the rate no better than PATH_SD_S / spread, however
-small their scatter. The slope is therefore shrunk towards zero drift by Bayes' rule for two Gaussians, the
-other being the prior of device clocks, `RATE_PRIOR_SD`: 6 s of sound give a rate near 1, ten minutes give the
-measured rate unchanged.
+How well a rate is known: a short recording cannot tell drift from a sound source that moved. Path differences between
+microphones change by some centimetres when the loudest source changes: `PATH_SD_S` in seconds. Windows that spread over
+`spread` seconds therefore know the rate no better than PATH_SD_S / spread, however small their scatter. So the slope
+is shrunk towards zero drift by Bayes' rule for two Gaussians; the other is the prior of device clocks, `RATE_PRIOR_SD`.
+6 s of sound give a rate near 1, ten minutes give the measured rate unchanged.
 
-What is measured is arrival time. Sound takes 2.9 ms per metre, so cameras at unequal distances from the
-source are off by that much until they are `shifted` by what their `sound_paths` say.
+Arrival time is what is measured. Sound takes 2.9 ms per metre: cameras at unequal distances from the source are off by
+that much until they are `shifted` by their `sound_paths`.
 """
 
 from __future__ import annotations
@@ -48,9 +47,11 @@ _TOLERANCE_S = 4e-4  # windows this close to the common line support it
 class ClockFit:
     """A camera's clock against the reference's: t_reference = start_s + clock_rate * t_local (seconds).
 
-    `confidence`: correlation peak over the highest other peak. `residual_rms_s`: scatter of the `n_windows`
-    windows about the line; `windows`: (local time, delay beyond the line) of each, in seconds. Where `status` is not
-    "ok", start_s and clock_rate are NaN: a doubtful track is never given an offset.
+    Attributes:
+        start_s, clock_rate: NaN where `status` is not "ok": a doubtful track is never given an offset.
+        confidence: correlation peak over the highest other peak.
+        residual_rms_s: scatter of the windows about the line.
+        windows: (local time, delay from the line) of each of the `n_windows`, seconds.
     """
 
     start_s: float
@@ -74,9 +75,10 @@ class ClockFit:
 class SequenceSync:
     """Residual synchronisation of one sequence: the paper's Sync RMS and the offsets it is made of.
 
-    `offsets_s`: camera -> residual offset, centred by their mean; `unmeasured`: cameras whose sound within
-    the sequence says nothing (the paper's dagger); `rms_s` over the measured ones, None where fewer than two
-    are.
+    Attributes:
+        rms_s: over the measured cameras; None where fewer than two are.
+        offsets_s: camera -> residual offset, less their mean.
+        unmeasured: cameras whose sound within the sequence tells nothing (the paper's dagger).
     """
 
     rms_s: float | None
@@ -156,7 +158,7 @@ def _fit_pair(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> ClockF
             continue
         # What drift may add or take away on the way from the middle, and the coarseness of the lag itself.
         reach = MAX_DRIFT * overlap / 2 + 0.012
-        windows = delay.measure(x, y, rate, (lag, 1.0), reach, _window_seconds(overlap), most=30)
+        windows = delay.measure(x, y, rate, (lag, 1.0), reach, _window_seconds(overlap), max_windows=30)
         support, candidate = _consensus(windows, lag, rate_prior_sd)
         if candidate is not None and support > best:
             best, line = support, candidate
@@ -170,12 +172,12 @@ def _fit_pair(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> ClockF
             return _flagged("unrelated", 0.0, len(windows))
         line = refined
     confidence = delay.peak_ratio(x, y, rate, line)
-    kept, residuals = _inliers(windows, line)
-    if confidence < MIN_CONFIDENCE or len(kept) < 2:
-        return _flagged("unrelated", confidence, len(kept))
+    inliers, residuals = _inliers(windows, line)
+    if confidence < MIN_CONFIDENCE or len(inliers) < 2:
+        return _flagged("unrelated", confidence, len(inliers))
     rms = float(np.sqrt(np.mean(residuals**2)))
-    scatter = tuple((window.time_s, float(residual)) for window, residual in zip(kept, residuals))
-    return ClockFit(line[0], line[1], confidence, rms, len(kept), "ok", scatter)
+    scatter = tuple((window.time_s, float(residual)) for window, residual in zip(inliers, residuals))
+    return ClockFit(line[0], line[1], confidence, rms, len(inliers), "ok", scatter)
 
 
 def _window_seconds(overlap: float) -> float:
@@ -252,8 +254,8 @@ def sequence_sync_rms(
 ) -> SequenceSync:
     """The paper's Sync RMS: offsets re-estimated by GCC-PHAT within the sequence, centred, RMS over cameras.
 
-    `interval`: seconds on the reference's clock, widened by `margin_s` at both ends. `fits` is what the
-    frames were chosen by, so what is found here is what it left over, up to 50 ms.
+    `interval`: seconds on the reference's clock, widened by `margin_s` at both ends. The frames were chosen by `fits`;
+    the offsets here are what those leave over, up to 50 ms.
     """
     x, x_start = audio[reference]
     offsets = {reference: 0.0}
@@ -262,17 +264,17 @@ def sequence_sync_rms(
         if camera == reference:
             continue
         fit = fits[camera]
-        found = None
+        window = None
         if fit.status == "ok":
             line = (fit.start_s + fit.clock_rate * y_start - x_start, fit.clock_rate)
             local = fit.to_local([interval[0] - margin_s, interval[1] + margin_s]) - y_start
-            found = delay.measure_span(x, y, rate, line, 0.05, (float(local[0]), float(local[1])))
-        if found is None or found.prominence < MIN_CONFIDENCE:
+            window = delay.measure_span(x, y, rate, line, 0.05, (float(local[0]), float(local[1])))
+        if window is None or window.prominence < MIN_CONFIDENCE:
             unmeasured.append(camera)
         else:
             # Sound that arrives later by the reference's clock than the fit says: the fit put the camera too
             # early.
-            offsets[camera] = found.delay_s - (line[0] + (line[1] - 1) * found.time_s)
+            offsets[camera] = window.delay_s - (line[0] + (line[1] - 1) * window.time_s)
     if len(offsets) < 2:
         return SequenceSync(None, {}, tuple(unmeasured))
     mean = float(np.mean(list(offsets.values())))
@@ -286,9 +288,9 @@ def sound_paths(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """The way of the sound to every camera, in metres, and what it adds to the start of the camera's clock, seconds.
 
-    `positions`: camera -> [3]; `source`: [3], both in metres in the same frame. Sound reached camera and reference at
-    different times, which the fit took for the same: a camera farther away than the reference heard it later, so its
-    clock shows a later time than was believed.
+    `positions`: camera -> [3]; `source`: [3], both in metres in the same frame. The fit takes the arrivals of a sound
+    at camera and reference for the same time. A camera farther away records it later, so its clock shows a later time
+    than the fit believes.
     """
     where = np.asarray(source, np.float64)
     distance = {camera: float(np.linalg.norm(np.asarray(at, np.float64) - where)) for camera, at in positions.items()}

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.arrays import Indices
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.arrays import Indices
 from splashbench.prepare.calibration.lens import OPENCV_PIXEL_SHIFT, Array
 
 MIN_CORNERS = 6  # a homography has eight unknowns: six corners leave enough residual to judge it

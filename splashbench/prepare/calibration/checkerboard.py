@@ -166,8 +166,8 @@ def _renumbered(view: BoardView, turn: NDArray[np.int64], detector: Detector) ->
 def _x_axis(view: BoardView, lens: Lens, w2c: Array) -> Array:
     """Direction [3] of the board's x axis in the world, from this view alone; zeros where no pose fits."""
     points = np.column_stack([view.points - view.points.mean(0), np.zeros(len(view.points))])
-    found, rotation, _ = cv2.solvePnP(points, lens.normalise(view.pixels), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    return np.asarray(w2c[:3, :3].T @ cv2.Rodrigues(rotation)[0][:, 0]) if found else np.zeros(3)
+    solved, rotation, _ = cv2.solvePnP(points, lens.normalise(view.pixels), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    return np.asarray(w2c[:3, :3].T @ cv2.Rodrigues(rotation)[0][:, 0]) if solved else np.zeros(3)
 
 
 def _spacing(grid: Array) -> Array:

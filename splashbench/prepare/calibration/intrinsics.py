@@ -1,13 +1,13 @@
 """Intrinsics of one camera from a clip or photographs of the board moved in front of it (paper Sec. 3, "Capture and
 calibration").
 
-A small residual does not prove a right focal length, so the result carries what does: the focal length's standard
+A small residual does not prove a right focal length. So the result carries better evidence: the focal length's standard
 deviation, how much of the image the board visited, and the error on views that the fit never saw. Detections that no
 plane explains are dropped before calibrating: one of them can move the focal length tenfold.
 
-Corners of one view err together: the board bends in the hand, the image blurs one way, light spreads. Counting them as
-independent makes the focal length look several times surer than it is (measured on photographs: two to four times), so
-the deviation comes from leaving out whole views in turn (jackknife; Efron and Stein, Annals of Statistics 9(3), 1981).
+Corners of one view err together: the board bends in the hand, the image blurs one way, light spreads. Counted as
+independent, they make the focal length look two to four times surer than it is (measured on photographs). So the
+deviation comes from leaving out whole views in turn (jackknife; Efron and Stein, Annals of Statistics 9(3), 1981).
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ def calibrate(images: Iterable[NDArray[np.uint8]], detector: Detector, source: s
         view = detector.detect(image)
         if view is None:
             continue
-        if not view.lies_on_a_plane(size) and (again := detector.detect_true(image)) is not None:
+        if not view.lies_on_a_plane(size) and (true_view := detector.detect_true(image)) is not None:
             n_replaced += 1
-            view = again
+            view = true_view
         views.append(view)
-    found = calibrate_views(views, detector, size, source, n_searched)
-    return replace(found, n_false=found.n_false + n_replaced)
+    calibration = calibrate_views(views, detector, size, source, n_searched)
+    return replace(calibration, n_false=calibration.n_false + n_replaced)
 
 
 def calibrate_views(
@@ -93,24 +93,24 @@ def calibrate_views(
     _require(len(chosen), detector, source, n_searched)
     trimmed = _without_outlier_corners(chosen, size)
     errors = _fit(trimmed, size).view_errors
-    good = [index for index, error in enumerate(errors) if error <= OUTLIER_FACTOR * np.median(errors)]
-    kept = [trimmed[index] for index in good]
-    _require(len(kept), detector, source, n_searched)
-    final = _fit(kept, size)
-    pixels = np.concatenate([view.pixels for view in kept])
+    inliers = [index for index, error in enumerate(errors) if error <= OUTLIER_FACTOR * np.median(errors)]
+    used = [trimmed[index] for index in inliers]
+    _require(len(used), detector, source, n_searched)
+    fit = _fit(used, size)
+    pixels = np.concatenate([view.pixels for view in used])
     return Calibration(
-        lens=final.lens,
-        rms_px=final.rms,
-        held_out_rms_px=_held_out_rms(kept, size),
-        focal_sigma_px=final.focal_sigma,
+        lens=fit.lens,
+        rms_px=fit.rms,
+        held_out_rms_px=_held_out_rms(used, size),
+        focal_sigma_px=fit.focal_sigma,
         coverage=coverage(pixels, size),
         n_searched=n_searched,
         n_detected=len(detections),
         n_false=len(detections) - len(true_views),
-        n_outliers=len(chosen) - len(kept),
-        n_views=len(kept),
+        n_outliers=len(chosen) - len(used),
+        n_views=len(used),
         view_points=pixels,
-        n_outlier_corners=sum(len(chosen[index].ids) - len(trimmed[index].ids) for index in good),
+        n_outlier_corners=sum(len(chosen[index].ids) - len(trimmed[index].ids) for index in inliers),
     )
 
 
@@ -127,8 +127,8 @@ def focal_guess(images: Iterable[NDArray[np.uint8]], detector: Detector) -> floa
         views += [view] if view is not None else []
     if len(views) < MIN_VIEWS_BY_CHANCE:
         return None
-    held = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
-    return _fit(views, size, held | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3).lens.focal
+    fixed = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
+    return _fit(views, size, fixed | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3).lens.focal
 
 
 def reject_false(detections: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
@@ -202,45 +202,47 @@ def _fit(views: list[BoardView], size: tuple[int, int], fixed: int = 0) -> _Fit:
 
 def _free_columns(fixed: int) -> list[int]:
     """Which of fx, fy, cx, cy, k1, k2, p1, p2, k3 a fit with the flags `fixed` determines."""
-    held = {
+    columns_of_flag = {
         cv2.CALIB_FIX_PRINCIPAL_POINT: (2, 3),
         cv2.CALIB_FIX_K1: (4,),
         cv2.CALIB_FIX_K2: (5,),
         cv2.CALIB_ZERO_TANGENT_DIST: (6, 7),
         cv2.CALIB_FIX_K3: (8,),
     }
-    out = {column for flag, columns in held.items() if fixed & flag for column in columns}
-    return [column for column in range(9) if column not in out]
+    fixed_columns = {column for flag, columns in columns_of_flag.items() if fixed & flag for column in columns}
+    return [column for column in range(9) if column not in fixed_columns]
 
 
 def _deviations(per_view: list[tuple[Array, Array]], free: list[int]) -> Array:
-    """Standard deviations [9] of fx, fy, cx, cy, k1, k2, p1, p2, k3; zero for those held, infinite where undetermined.
+    """Standard deviations [9] of fx, fy, cx, cy, k1, k2, p1, p2, k3: zero where fixed, infinite where undetermined.
 
     `per_view`: errors [2N] and their derivatives [2N, 15] by the view's pose (6) and by the lens (9). The larger of two
     estimates: with errors independent from corner to corner, and the jackknife over views, linearised at the optimum.
     """
-    normal, gradients = [], []
+    normals, gradients = [], []
     squares, freedom = 0.0, -len(free)
     for error, jacobian in per_view:
-        # What the view's own pose cannot account for.
+        # What the view's pose cannot account for.
         basis, _ = np.linalg.qr(jacobian[:, :6])
         lens = jacobian[:, 6:][:, free]
         lens = lens - basis @ (basis.T @ lens)
-        rest = error - basis @ (basis.T @ error)
-        normal.append(lens.T @ lens)
-        gradients.append(lens.T @ rest)
-        squares += float(rest @ rest)
+        residual = error - basis @ (basis.T @ error)
+        normals.append(lens.T @ lens)
+        gradients.append(lens.T @ residual)
+        squares += float(residual @ residual)
         freedom += len(error) - 6
     result = np.zeros(9)
-    count, whole = len(per_view), np.sum(normal, axis=0)
+    count, information = len(per_view), np.sum(normals, axis=0)
     try:
-        inverse = np.diag(np.linalg.inv(whole))
-        without = np.array([np.linalg.solve(whole - part, -gradient) for part, gradient in zip(normal, gradients)])
+        inverse = np.diag(np.linalg.inv(information))
+        shifts = np.array(
+            [np.linalg.solve(information - part, -gradient) for part, gradient in zip(normals, gradients)]
+        )
     except np.linalg.LinAlgError:
         result[free] = np.inf
         return result
     independent = np.where(inverse > 0, inverse, np.inf) * (squares / max(freedom, 1))
-    jackknife = (count - 1) / count * ((without - without.mean(0)) ** 2).sum(0)
+    jackknife = (count - 1) / count * ((shifts - shifts.mean(0)) ** 2).sum(0)
     result[free] = np.sqrt(np.maximum(independent, jackknife))
     return result
 
@@ -255,9 +257,9 @@ def _without_outlier_corners(views: list[BoardView], size: tuple[int, int]) -> l
         typical = float(np.median(np.concatenate(fit.corner_errors)))
         trimmed = []
         for view, error in zip(views, fit.corner_errors):
-            kept = error <= CORNER_OUTLIER_FACTOR * max(typical, float(np.median(error)))
-            enough = kept.sum() >= MIN_CORNERS and not collinear(view.points[kept])
-            trimmed.append(BoardView(view.ids[kept], view.points[kept], view.pixels[kept]) if enough else view)
+            inliers = error <= CORNER_OUTLIER_FACTOR * max(typical, float(np.median(error)))
+            enough = inliers.sum() >= MIN_CORNERS and not collinear(view.points[inliers])
+            trimmed.append(BoardView(view.ids[inliers], view.points[inliers], view.pixels[inliers]) if enough else view)
         if sum(len(view.ids) for view in trimmed) == sum(len(view.ids) for view in views):
             break
         views = trimmed
@@ -278,14 +280,14 @@ def _held_out_rms(views: list[BoardView], size: tuple[int, int]) -> float:
 
 
 def _rms_on(views: list[BoardView], lens: Lens) -> float:
-    """RMS reprojection error of views whose pose alone is fitted, the lens held."""
+    """RMS reprojection error of views under a fixed lens; only their poses are fitted."""
     squares: list[Array] = []
     for view in views:
         pixels = (view.pixels - OPENCV_PIXEL_SHIFT).astype(np.float32)
-        found, rotation, translation = cv2.solvePnP(
+        solved, rotation, translation = cv2.solvePnP(
             _object_points(view), pixels, lens.opencv_K(), lens.distortion, flags=cv2.SOLVEPNP_ITERATIVE
         )
-        if found:
+        if solved:
             points = _object_points(view) @ cv2.Rodrigues(rotation)[0].T + translation.ravel()
             squares.append(((lens.project(points) - view.pixels) ** 2).sum(1))
     return float(np.sqrt(np.concatenate(squares).mean())) if squares else float("inf")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splashbench.prepare.arrays import Floats
+from splashbench.arrays import Floats
 
 Array = Floats
 OPENCV_PIXEL_SHIFT = 0.5  # our pixel coordinate minus OpenCV's, for the same point of the image
@@ -37,8 +37,8 @@ class Lens:
         shifted = np.asarray(K, np.float64).copy()
         shifted[:2, 2] += OPENCV_PIXEL_SHIFT
         coefficients = np.zeros(5)
-        given = np.asarray(distortion, np.float64).ravel()[:5]
-        coefficients[: len(given)] = given
+        known_coefficients = np.asarray(distortion, np.float64).ravel()[:5]
+        coefficients[: len(known_coefficients)] = known_coefficients
         return cls(width, height, shifted, coefficients)
 
     @property

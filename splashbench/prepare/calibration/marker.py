@@ -35,14 +35,14 @@ def is_on_board(marker: MarkerLayout, board: BoardLayout) -> bool:
     be taken for the marker."""
     if board.dictionary is None:
         return False
-    wanted, carried = (
+    marker_dictionary, board_dictionary = (
         cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in (marker.dictionary, board.dictionary)
     )
-    if wanted.markerSize != carried.markerSize:
+    if marker_dictionary.markerSize != board_dictionary.markerSize:
         return False
     # bytesList: [markers, bytes, 4 turns of the marker].
-    turns = carried.bytesList[: board.squares_x * board.squares_y // 2]
-    return bool((turns == wanted.bytesList[marker.id][None, :, :1]).all(axis=1).any())
+    turns = board_dictionary.bytesList[: board.squares_x * board.squares_y // 2]
+    return bool((turns == marker_dictionary.bytesList[marker.id][None, :, :1]).all(axis=1).any())
 
 
 class MarkerDetector:

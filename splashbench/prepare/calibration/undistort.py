@@ -1,23 +1,31 @@
 """Raw, distorted frames to the pinhole images that scenes hold.
 
-The pinhole keeps the lens's own matrix K and the frame's size, so nothing is scaled in the middle of the image, where
-the liquid is. Under barrel distortion that cuts off what the lens squeezed into the corners, and no pixel is left
-without a source; under pincushion distortion the corners have none, and are black and outside every mask
-(`source_share` says how much of the image has a source).
+The pinhole keeps the lens's matrix K and the frame's size, so nothing is scaled in the middle of the image, where the
+liquid is. Barrel distortion: what the lens squeezed into the corners is cut off, and every pixel has a source.
+Pincushion distortion: the corners have no source, and are black and outside every mask. `source_share` tells how much
+of the image has a source.
 
-Images are interpolated with cubics: bilinear interpolation blurs a thin stream visibly. Masks are interpolated
-linearly as 0/1 and cut at one half, which places their outline to a fraction of a pixel without bias; the nearest
+Images are interpolated with cubics, as bilinear interpolation blurs a thin stream visibly. Masks are interpolated
+linearly as 0/1 and cut at one half: their outline then lies right to a fraction of a pixel, without bias. The nearest
 pixel would shift it by up to half a pixel, and a cubic's overshoot could make islands.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.prepare.calibration.lens import OPENCV_PIXEL_SHIFT, Lens
-from splashbench.prepare.crop import Box
+from splashbench.prepare.crop import PixelBox
+from splashbench.scene.camera import Camera
+
+
+def pinhole_cameras(lenses: Mapping[str, Lens], w2c: Mapping[str, NDArray[np.float64]]) -> dict[str, Camera]:
+    """The cameras of undistorted, uncropped frames."""
+    return {name: Camera(name, lens.width, lens.height, lens.K, w2c[name]) for name, lens in lenses.items()}
 
 
 class Undistorter:
@@ -37,7 +45,7 @@ class Undistorter:
         """Pixels of the frame."""
         return self.lens.width * self.lens.height
 
-    def source_share(self, window: Box | None = None) -> float:
+    def source_share(self, window: PixelBox | None = None) -> float:
         """Share of the pinhole image's pixels that the raw frame covers, within `window` where one is given."""
         inside = (self._x >= -0.5) & (self._x <= self.lens.width - 0.5)
         inside &= (self._y >= -0.5) & (self._y <= self.lens.height - 0.5)

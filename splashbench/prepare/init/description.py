@@ -17,22 +17,22 @@ from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_text
 from splashbench.prepare.init.board_guess import BoardGuess, guess_board
-from splashbench.prepare.init.discovery import Film, Filmed, cameras_of, find_films
-from splashbench.prepare.init.inspection import Look, MarkerFinder, assign, few_frames, look_at
+from splashbench.prepare.init.discovery import FoundRecording, Subject, cameras_of, find_recordings
+from splashbench.prepare.init.inspection import Inspection, MarkerFinder, assign, few_frames, inspect_recording
 from splashbench.prepare.session import DESCRIPTION
 from splashbench.prepare.video.recording import Recording
 from splashbench.progress import track
 
 _HELD_OUT_SHARE = 2 / 7  # the paper holds out two of seven cameras
 _BOARD_FRAMES = 12
-_SUBJECTS: tuple[Filmed, ...] = ("pour", "static", "intrinsics")
+_SUBJECTS: tuple[Subject, ...] = ("pour", "static", "intrinsics")
 
 
 @dataclass(frozen=True)
 class Description:
-    """What was found: the films by subject, the board where one was recognised, and what is left to a person."""
+    """What was described: recordings by subject, the board where one was recognised, what is left to a person."""
 
-    films: tuple[Film, ...]
+    recordings: tuple[FoundRecording, ...]
     cameras: tuple[str, ...]
     board: BoardGuess | None
     to_do: tuple[str, ...]
@@ -43,7 +43,7 @@ def describe(folder: Path, square_metres: float | None = None, replace: bool = F
     """Write FOLDER/session.toml by looking at the recordings below FOLDER.
 
     square_metres: side of one square of the printed board, which no picture tells. Raises SplashbenchError where there
-    is a session.toml already (unless `replace`), no film, or a film that cannot be read.
+    is a session.toml already (unless `replace`), no video, or a video that cannot be read.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -51,70 +51,74 @@ def describe(folder: Path, square_metres: float | None = None, replace: bool = F
     path = folder / DESCRIPTION
     if path.exists() and not replace:
         raise SplashbenchError(f"{path} exists already; edit it, or --replace to write it anew")
-    films = _with_subjects(folder, find_films(folder))
-    cameras = cameras_of(film for film in films if film.filmed is not None)
+    recordings = _with_subjects(folder, find_recordings(folder))
+    cameras = cameras_of(recording for recording in recordings if recording.subject is not None)
     if len(cameras) < 2:
         raise SplashbenchError(
-            f"{folder}: films of {len(cameras)} cameras were told apart; put every camera's files into a folder of its"
+            f"{folder}: videos of {len(cameras)} cameras were told apart; put every camera's files into a folder of its"
             " name, or its name before theirs (cam1_GX010001.MP4)"
         )
-    board = guess_board(_board_images(folder, films))
-    text, to_do = _text(folder, films, cameras, board, square_metres)
+    board = guess_board(_board_images(folder, recordings))
+    text, to_do = _text(folder, recordings, cameras, board, square_metres)
     write_text(path, text)
-    return Description(tuple(films), tuple(cameras), board, tuple(to_do), path)
+    return Description(tuple(recordings), tuple(cameras), board, tuple(to_do), path)
 
 
-def _with_subjects(folder: Path, films: list[Film]) -> list[Film]:
+def _with_subjects(folder: Path, recordings: list[FoundRecording]) -> list[FoundRecording]:
     """Films with what they show; those whose names do not say are looked at."""
-    unnamed = [film for film in films if film.filmed is None]
-    looks: dict[tuple[str, ...], Look] = {}
+    unnamed = [recording for recording in recordings if recording.subject is None]
+    inspections: dict[tuple[str, ...], Inspection] = {}
     finder = MarkerFinder()
-    board = next((film for film in films if film.filmed == "intrinsics"), None)
-    if unnamed and board is not None:  # sooner here than by trying every kind of marker on films without any
+    board = next((recording for recording in recordings if recording.subject == "intrinsics"), None)
+    if unnamed and board is not None:  # sooner here than by trying every kind of marker on recordings without any
         finder.settle(few_frames(Recording([folder / name for name in board.files])))
-    for film in track(unnamed, "looking at films"):
-        looks[film.files] = look_at([folder / name for name in film.files], finder)
-    by_camera: dict[str, list[Film]] = {}
-    for film in films:
-        by_camera.setdefault(film.camera, []).append(film)
-    known = [film for group in by_camera.values() for film in assign(group, looks)]
-    # A second film of the same subject would be listed as more chapters of the first: the longest stands.
-    return _one_of_each(folder, known)
+    for recording in track(unnamed, "looking at videos"):
+        inspections[recording.files] = inspect_recording([folder / name for name in recording.files], finder)
+    by_camera: dict[str, list[FoundRecording]] = {}
+    for recording in recordings:
+        by_camera.setdefault(recording.camera, []).append(recording)
+    subjects_told = [recording for group in by_camera.values() for recording in assign(group, inspections)]
+    # A second recording of the same subject would be listed as more chapters of the first: the longest stands.
+    return _one_of_each(folder, subjects_told)
 
 
-def _one_of_each(folder: Path, films: list[Film]) -> list[Film]:
-    chosen: dict[tuple[str, Filmed], Film] = {}
-    left: list[Film] = []
-    for film in films:
-        if film.filmed is None:
-            left.append(film)
+def _one_of_each(folder: Path, recordings: list[FoundRecording]) -> list[FoundRecording]:
+    chosen: dict[tuple[str, Subject], FoundRecording] = {}
+    unused: list[FoundRecording] = []
+    for recording in recordings:
+        if recording.subject is None:
+            unused.append(recording)
             continue
-        key = (film.camera, film.filmed)
-        if key not in chosen or _bytes(folder, film) > _bytes(folder, chosen[key]):
-            left += [Film(chosen[key].files, film.camera, None)] if key in chosen else []
-            chosen[key] = film
+        key = (recording.camera, recording.subject)
+        if key not in chosen or _bytes(folder, recording) > _bytes(folder, chosen[key]):
+            unused += [FoundRecording(chosen[key].files, recording.camera, None)] if key in chosen else []
+            chosen[key] = recording
         else:
-            left.append(Film(film.files, film.camera, None))
-    return [*chosen.values(), *left]
+            unused.append(FoundRecording(recording.files, recording.camera, None))
+    return [*chosen.values(), *unused]
 
 
-def _bytes(folder: Path, film: Film) -> int:
-    return sum((folder / name).stat().st_size for name in film.files)
+def _bytes(folder: Path, recording: FoundRecording) -> int:
+    return sum((folder / name).stat().st_size for name in recording.files)
 
 
-def _board_images(folder: Path, films: Sequence[Film]) -> list[NDArray[np.uint8]]:
+def _board_images(folder: Path, recordings: Sequence[FoundRecording]) -> list[NDArray[np.uint8]]:
     """Grey frames of the first camera's board clip."""
-    clip = next((film for film in films if film.filmed == "intrinsics"), None)
+    clip = next((recording for recording in recordings if recording.subject == "intrinsics"), None)
     if clip is None:
         return []
-    recording = Recording([folder / name for name in clip.files])
-    count = len(recording.frame_times)
+    video = Recording([folder / name for name in clip.files])
+    count = len(video.frame_times)
     indices = np.unique(np.linspace(0, count - 1, min(count, _BOARD_FRAMES)).astype(int)).tolist()
-    return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for _, image in recording.frames(indices)]
+    return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for _, image in video.frames(indices)]
 
 
 def _text(
-    folder: Path, films: Sequence[Film], cameras: Sequence[str], board: BoardGuess | None, square_metres: float | None
+    folder: Path,
+    recordings: Sequence[FoundRecording],
+    cameras: Sequence[str],
+    board: BoardGuess | None,
+    square_metres: float | None,
 ) -> tuple[str, list[str]]:
     """session.toml, and what a person has to do about it."""
     held_out = max(1, round(_HELD_OUT_SHARE * len(cameras)))
@@ -122,7 +126,7 @@ def _text(
     name = "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in folder.resolve().name)
     name = name if name[:1].isalnum() and name.isascii() else "session"
     blocks = [
-        "# Written by `splashbench prepare --init` from what it saw; check it, and mend what it got wrong.\n"
+        "# Written by `splashbench prepare --init` from what it saw; check it, and correct what it got wrong.\n"
         "# The first camera's clock is the scene's. `test` cameras are held out: no reconstruction sees them.\n"
         + toml.dumps(
             {
@@ -141,25 +145,26 @@ def _text(
         to_do.append("describe the ChArUco board under [board]: none was recognised")
     elif square_metres is None:
         to_do.append("measure one printed square and set square_metres and marker_metres under [board]")
-    recordings = {
-        subject: {film.camera: list(film.files) for film in films if film.filmed == subject} for subject in _SUBJECTS
+    files_of = {
+        subject: {recording.camera: list(recording.files) for recording in recordings if recording.subject == subject}
+        for subject in _SUBJECTS
     }
-    for subject, listed in recordings.items():
+    for subject, listed in files_of.items():
         if listed:
             blocks.append(toml.dumps({"recordings": {subject: {c: listed[c] for c in cameras if c in listed}}}))
         missing = [camera for camera in cameras if camera not in listed]
         if missing:
             to_do.append(f"no {subject} recording was told for camera {', '.join(missing)}: add [recordings.{subject}]")
-    sweep = [film for film in films if film.filmed == "sweep"]
+    sweep = [recording for recording in recordings if recording.subject == "sweep"]
     if sweep:
         blocks.append(toml.dumps({"sweep": {"files": list(sweep[0].files)}}))
     else:
         to_do.append("no handheld sweep was found; without one the cameras must share enough of the scene")
     blocks.append(toml.dumps({"masks": {"provider": "background"}}))
-    unused = [name for film in [*films, *sweep[1:]] if film.filmed is None for name in film.files]
+    unused = [name for recording in [*recordings, *sweep[1:]] if recording.subject is None for name in recording.files]
     if unused:
         blocks.append("# Not used:\n" + "".join(f"#   {name}\n" for name in unused))
-        to_do.append(f"{len(unused)} films are not used; they are listed at the end of {DESCRIPTION}")
+        to_do.append(f"{len(unused)} videos are not used; they are listed at the end of {DESCRIPTION}")
     return "\n".join(blocks), to_do
 
 

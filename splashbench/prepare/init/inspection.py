@@ -1,7 +1,7 @@
 """What a recording shows, where its name does not say: the board waved about, a scene at rest, liquid, a sweep.
 
-Looked at are a few small frames. A clip in which markers are seen and travel is for the lens; one in which nothing
-changes is the static scene; a camera that itself travels is the sweep; of what is left, the longest is the pour.
+A few small frames decide. A clip in which markers are seen and travel is for the lens. One in which nothing changes is
+the static scene. A camera that itself travels is the sweep. Of what is left, the longest is the pour.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.prepare.init.discovery import Film, Filmed, with_subject
+from splashbench.prepare.init.discovery import FoundRecording, Subject, with_subject
 from splashbench.prepare.video.recording import Recording
 
 FRAMES = 9
@@ -32,9 +32,16 @@ _SWEEP_SHIFT = 0.02  # of the image's width, that the whole picture shifts from 
 
 
 @dataclass(frozen=True)
-class Look:
-    """Of a few frames of a recording: share that shows markers, how far their middle wanders (image widths), mean
-    change of a pixel between first and others (grey levels), median shift of the whole picture (image widths)."""
+class Inspection:
+    """What a few frames of a recording show.
+
+    Attributes:
+        seconds: how long it lasts.
+        marker_share: of the frames, those that show markers.
+        marker_travel: how far the markers' middle wanders, image widths.
+        change: mean change of a pixel between the first and the others, grey levels of 255.
+        shift: of the whole picture from one frame to the next, median, image widths.
+    """
 
     seconds: float
     marker_share: float
@@ -50,8 +57,8 @@ def few_frames(recording: Recording) -> list[NDArray[np.uint8]]:
     return [_small(image) for _, image in recording.frames(indices)]
 
 
-def look_at(paths: Sequence[Path], finder: MarkerFinder) -> Look:
-    """Look at a recording. Raises SplashbenchError where it cannot be read."""
+def inspect_recording(paths: Sequence[Path], finder: MarkerFinder) -> Inspection:
+    """Inspection at a recording. Raises SplashbenchError where it cannot be read."""
     recording = Recording(paths)
     images = few_frames(recording)
     if finder.dictionary is None:
@@ -61,7 +68,7 @@ def look_at(paths: Sequence[Path], finder: MarkerFinder) -> Look:
     first = images[0].astype(np.float32)
     change = max((float(np.abs(image.astype(np.float32) - first).mean()) for image in images[1:]), default=0.0)
     shifts = [_shift(a, b) for a, b in pairwise(images)]
-    return Look(
+    return Inspection(
         seconds=recording.info.duration,
         marker_share=len(middles) / len(images),
         marker_travel=travel,
@@ -86,7 +93,7 @@ class Markers:
 
 @dataclass
 class MarkerFinder:
-    """Finds markers, once it has settled which: a session has one board, so what is settled serves all its films.
+    """Finds markers, once it has settled which: a session has one board, so what is settled serves all its recordings.
 
     `dictionary`: one of `DICTIONARIES`, None until settled; `inverted`: light on dark.
     """
@@ -96,14 +103,14 @@ class MarkerFinder:
 
     def settle(self, images: Sequence[NDArray[np.uint8]]) -> None:
         """Settle on the kind of marker that is seen most in a few grey images [H, W], if any is seen."""
-        most = 0
+        most_markers = 0
         some = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, _SETTLING_FRAMES).astype(int))]
         for name in DICTIONARIES:
             for inverted in (False, True):
                 counts = [len(_detect(image, name, inverted).ids) for image in some]
-                if max(counts) >= _MIN_MARKERS and sum(counts) > most:
-                    most, self.dictionary, self.inverted = sum(counts), name, inverted
-                if most > _CLEAR * len(some):
+                if max(counts) >= _MIN_MARKERS and sum(counts) > most_markers:
+                    most_markers, self.dictionary, self.inverted = sum(counts), name, inverted
+                if most_markers > _CLEAR * len(some):
                     return
 
     def find(self, image: NDArray[np.uint8]) -> Markers:
@@ -120,7 +127,7 @@ def _detect(image: NDArray[np.uint8], dictionary: str, inverted: bool) -> Marker
     corners, ids, _ = detector.detectMarkers(cv2.bitwise_not(image) if inverted else image)
     return Markers(
         np.zeros(0, np.int64) if ids is None else np.ravel(ids).astype(np.int64),
-        np.array([np.reshape(found, (4, 2)) for found in corners], np.float32).reshape(-1, 4, 2),
+        np.array([np.reshape(marker, (4, 2)) for marker in corners], np.float32).reshape(-1, 4, 2),
     )
 
 
@@ -138,30 +145,34 @@ def _shift(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
     return float(np.hypot(x, y)) / a.shape[1]
 
 
-def assign(films: Sequence[Film], looks: dict[tuple[str, ...], Look]) -> list[Film]:
-    """One camera's films with what each shows, as far as it can be told; `looks` by the films' files.
+def assign(
+    recordings: Sequence[FoundRecording], inspections: dict[tuple[str, ...], Inspection]
+) -> list[FoundRecording]:
+    """One camera's recordings with their subjects, as far as these can be told; `inspections` by the recordings' files.
 
-    What names said stays. A subject is given to one film at most.
+    A subject that a name states stays. A subject is given to one recording at most.
     """
-    taken = {film.filmed for film in films if film.filmed}
-    open_films = [film for film in films if film.filmed is None]
-    named = [film for film in films if film.filmed is not None]
+    taken = {recording.subject for recording in recordings if recording.subject}
+    undecided = [recording for recording in recordings if recording.subject is None]
+    named = [recording for recording in recordings if recording.subject is not None]
 
-    def take(filmed: Filmed, candidates: list[Film]) -> None:
-        if filmed not in taken and candidates:
+    def take(subject: Subject, candidates: list[FoundRecording]) -> None:
+        if subject not in taken and candidates:
             chosen = candidates[0]
-            open_films.remove(chosen)
-            named.append(with_subject(chosen, filmed))
-            taken.add(filmed)
+            undecided.remove(chosen)
+            named.append(with_subject(chosen, subject))
+            taken.add(subject)
 
-    def look(film: Film) -> Look:
-        return looks[film.files]
+    def inspection(recording: FoundRecording) -> Inspection:
+        return inspections[recording.files]
 
-    if not named and len(open_films) == 1 and look(open_films[0]).shift > _SWEEP_SHIFT:
-        return [with_subject(open_films[0], "sweep")]
-    waved = [f for f in open_films if look(f).marker_share >= _SEEN_SHARE and look(f).marker_travel > _TRAVEL]
-    take("intrinsics", sorted(waved, key=lambda f: -look(f).marker_share * look(f).marker_travel))
-    still = [f for f in open_films if look(f).change < _STILL_GREY]
-    take("static", sorted(still, key=lambda f: look(f).change))
-    take("pour", sorted(open_films, key=lambda f: -look(f).seconds))
-    return [*named, *open_films]
+    if not named and len(undecided) == 1 and inspection(undecided[0]).shift > _SWEEP_SHIFT:
+        return [with_subject(undecided[0], "sweep")]
+    waved = [
+        f for f in undecided if inspection(f).marker_share >= _SEEN_SHARE and inspection(f).marker_travel > _TRAVEL
+    ]
+    take("intrinsics", sorted(waved, key=lambda f: -inspection(f).marker_share * inspection(f).marker_travel))
+    still = [f for f in undecided if inspection(f).change < _STILL_GREY]
+    take("static", sorted(still, key=lambda f: inspection(f).change))
+    take("pour", sorted(undecided, key=lambda f: -inspection(f).seconds))
+    return [*named, *undecided]

@@ -32,8 +32,8 @@ def thumbnail(image: Image, mask: Mask, width: int, height: int) -> tuple[Image,
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(image, size, interpolation=how)
     share = cv2.resize(mask.astype(np.float32), size, interpolation=how)
-    found = share >= 0.5
-    return np.asarray(small, np.uint8), np.asarray(found if found.any() else share > 0)
+    covered = share >= 0.5
+    return np.asarray(small, np.uint8), np.asarray(covered if covered.any() else share > 0)
 
 
 def outlined(image: Image, mask: Mask) -> Image:

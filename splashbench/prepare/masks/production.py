@@ -1,7 +1,7 @@
-"""Masks of a whole session: the provider asked for, undistortion, and the boxes that the crop follows from.
+"""Masks of a session: the provider asked for, undistortion, and the boxes that the crop follows from.
 
-Masks are made before the crop is known, and the crop before the scene is written, so they wait on disk in between: at
-4K the masks of one scene are gigabytes.
+Masks are made before the crop is known, and the crop before the scene is written. In between masks wait on disk: at 4K
+those of one scene are gigabytes.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray, write_png
 from splashbench.prepare.audio.sync import ClockFit
 from splashbench.prepare.calibration.undistort import Undistorter
-from splashbench.prepare.crop import Box, bounding_box, crop_window
+from splashbench.prepare.crop import PixelBox, bounding_box, crop_window
 from splashbench.prepare.masks.background import BackgroundMasks
-from splashbench.prepare.masks.provider import FolderMasks, Mask, MaskProvider, mask_health
-from splashbench.prepare.masks.sheet import mask_faults
-from splashbench.prepare.preparation import MaskRecord
+from splashbench.prepare.masks.provider import FolderMasks, Mask, MaskHealth, MaskProvider, mask_health
+from splashbench.prepare.masks.sheet import Faults, mask_faults
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.video.recording import Recording
 
@@ -60,9 +59,9 @@ def sam3_provider(session: Session, pour: Mapping[str, Recording]) -> MaskProvid
     """Masks by SAM3 as the session describes them. Raises SplashbenchError where the checkpoint or a click is none."""
     from splashbench.prepare.masks.sam3 import Sam3Masks
 
-    described = session.masks
-    assert described.checkpoint is not None
-    for camera, clicks in described.points.items():
+    table = session.masks
+    assert table.checkpoint is not None
+    for camera, clicks in table.points.items():
         count = len(pour[camera].frame_times)
         latest = max(click.frame for click in clicks)
         if latest >= count:
@@ -72,11 +71,11 @@ def sam3_provider(session: Session, pour: Mapping[str, Recording]) -> MaskProvid
             )
     return Sam3Masks(
         lambda camera, indices: pour[camera].frames(indices),
-        session.directory / described.checkpoint,
+        session.directory / table.checkpoint,
         {camera: str(recording.paths[0]) for camera, recording in pour.items()},
-        text=described.text,
-        points=described.points,
-        confidence=described.confidence,
+        text=table.text,
+        points=table.points,
+        confidence=table.confidence,
     )
 
 
@@ -93,7 +92,7 @@ class CameraMasks:
     """One camera's masks, undistorted and uncropped: area in pixels of each, and the union of their boxes."""
 
     areas: tuple[int, ...]
-    box: Box
+    box: PixelBox
 
 
 def make_masks(
@@ -109,7 +108,7 @@ def make_masks(
     Raises SplashbenchError where all are empty.
     """
     areas = []
-    union: Box | None = None
+    union: PixelBox | None = None
     for t, (_, raw) in enumerate(provider.masks(camera, indices)):
         mask = undistorter.mask(raw)
         areas.append(int(mask.sum()))
@@ -124,30 +123,40 @@ def make_masks(
     return CameraMasks(tuple(areas), union)
 
 
-class MaskStore:
-    """The masks of all cameras as `make_masks` left them: camera -> (folder, what was found)."""
+@dataclass(frozen=True)
+class MaskRecord:
+    """The masks as written: areas in pixels of the undistorted, uncropped frames, [T] per camera."""
 
-    def __init__(self, made: Mapping[str, tuple[Path, CameraMasks]]) -> None:
-        self._made = dict(made)
+    provider: str
+    areas: dict[str, list[int]]
+    health: dict[str, MaskHealth]
+    faults: Faults
+
+
+class MaskStore:
+    """The masks of all cameras as `make_masks` left them: camera -> (folder, areas and box)."""
+
+    def __init__(self, per_camera: Mapping[str, tuple[Path, CameraMasks]]) -> None:
+        self._per_camera = dict(per_camera)
 
     def record(self, provider: str, undistorters: Mapping[str, Undistorter]) -> MaskRecord:
         """The masks' areas and health, for the report."""
-        areas = {camera: list(found.areas) for camera, (_, found) in self._made.items()}
+        areas = {camera: list(masks.areas) for camera, (_, masks) in self._per_camera.items()}
         health = {camera: mask_health(areas[camera], undistorters[camera].n_pixels) for camera in areas}
         pixels = {camera: undistorters[camera].n_pixels for camera in areas}
         return MaskRecord(provider, areas, health, mask_faults(areas, pixels))
 
     def read(self, camera: str, t: int) -> Mask:
         """One mask [H, W]."""
-        return np.asarray(read_gray(_file(self._made[camera][0], t)) > 0)
+        return np.asarray(read_gray(_file(self._per_camera[camera][0], t)) > 0)
 
-    def windows(self, undistorters: Mapping[str, Undistorter], crop: bool) -> dict[str, Box]:
+    def windows(self, undistorters: Mapping[str, Undistorter], crop: bool) -> dict[str, PixelBox]:
         """Camera -> the window to be written: the paper's crop, or the whole frame."""
         windows = {}
         for camera, undistorter in undistorters.items():
             width, height = undistorter.lens.width, undistorter.lens.height
-            whole = Box(0, 0, width, height)
-            windows[camera] = crop_window(self._made[camera][1].box, width, height) if crop else whole
+            full = PixelBox(0, 0, width, height)
+            windows[camera] = crop_window(self._per_camera[camera][1].box, width, height) if crop else full
         return windows
 
 

@@ -21,7 +21,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.prepare.masks.provider import Mask
 from splashbench.prepare.masks.sam3_checkpoint import Sam3Checkpoint, seeded
 from splashbench.prepare.masks.sam3_tracking import ReadFrames, follow
-from splashbench.prepare.session import Click
+from splashbench.prepare.session_tables import MaskClick
 from splashbench.prepare.stage_cache import facts_of
 
 DEFAULT_TEXT = "liquid"
@@ -45,7 +45,7 @@ class Sam3Masks:
         sources: Mapping[str, str],
         *,
         text: str = DEFAULT_TEXT,
-        points: Mapping[str, Sequence[Click]] | None = None,
+        points: Mapping[str, Sequence[MaskClick]] | None = None,
         confidence: float = DEFAULT_CONFIDENCE,
         device: Literal["cpu", "cuda"] | None = None,
     ) -> None:
@@ -66,7 +66,7 @@ class Sam3Masks:
         self._confidence = confidence
         unknown = sorted(set(self._points) - set(sources))
         if unknown:
-            raise SplashbenchError(f"masks.points names camera {unknown[0]}, which is none; mend session.toml")
+            raise SplashbenchError(f"masks.points names camera {unknown[0]}, which is none; correct session.toml")
         without = [camera for camera in sources if camera not in self._points]
         if not self._text and without:
             raise SplashbenchError(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.masks.sam3_checkpoint import Sam3Checkpoint, seeded
-from splashbench.prepare.session import Click
+from splashbench.prepare.session_tables import MaskClick
 
 # (camera, increasing source frames) -> (source frame, image [H, W, 3])
 ReadFrames = Callable[[str, Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]]
@@ -29,7 +29,7 @@ def follow(
     checkpoint: Sam3Checkpoint,
     model: Any,
     read: Callable[[Sequence[int]], Iterator[tuple[int, NDArray[np.uint8]]]],
-    clicks: Sequence[Click],
+    clicks: Sequence[MaskClick],
     indices: Sequence[int],
     source: str,
 ) -> Mapping[int, Any]:
@@ -42,7 +42,7 @@ def follow(
     memory = _Memory(checkpoint, model)
     order = sorted({*indices, *(click.frame for click in clicks)})
     place = {frame: position for position, frame in enumerate(order)}
-    clicked: dict[int, list[Click]] = {}
+    clicked: dict[int, list[MaskClick]] = {}
     for click in clicks:
         clicked.setdefault(click.frame, []).append(click)
     logits = {}
@@ -52,7 +52,7 @@ def follow(
             if click.x > width or click.y > height:
                 raise SplashbenchError(
                     f"{source}: the click at ({click.x:g}, {click.y:g}) lies outside its frames of {width}x{height};"
-                    " mend masks.points in session.toml"
+                    " correct masks.points in session.toml"
                 )
         logits[frame] = memory.anchor(place[frame], image, clicked[frame])
     first = min(clicked)
@@ -83,7 +83,7 @@ class _Memory:
         )
         self._first: int | None = None
 
-    def anchor(self, position: int, image: NDArray[np.uint8], clicks: Sequence[Click]) -> Any:
+    def anchor(self, position: int, image: NDArray[np.uint8], clicks: Sequence[MaskClick]) -> Any:
         """A frame with clicks, the earliest first; returns its logits."""
         import torch
 

@@ -59,10 +59,10 @@ def mask_faults(
     for camera, sizes in areas.items():
         health = mask_health(sizes, n_pixels[camera])
         # Later ones say more.
-        found = dict.fromkeys((missed or {}).get(camera, ()), MISSED)
-        found |= dict.fromkeys(health.flooded, FLOODED) | dict.fromkeys(health.flickering, FLICKERING)
-        found |= {t: VANISHED if t in health.flickering else EMPTY for t in health.empty}
-        faults[camera] = {t: found[t] for t in sorted(found)}
+        reasons = dict.fromkeys((missed or {}).get(camera, ()), MISSED)
+        reasons |= dict.fromkeys(health.flooded, FLOODED) | dict.fromkeys(health.flickering, FLICKERING)
+        reasons |= {t: VANISHED if t in health.flickering else EMPTY for t in health.empty}
+        faults[camera] = {t: reasons[t] for t in sorted(reasons)}
     return faults
 
 
@@ -71,13 +71,13 @@ def sheet_times(n_frames: int, faults: Faults, columns: int) -> list[int]:
 
     Masks that are merely empty count least, as there is no liquid before it comes.
     """
-    count = np.zeros(n_frames)
-    for found in faults.values():
-        for t, reason in found.items():
-            count[t] += 0.01 if reason == EMPTY else 1.0
+    failures = np.zeros(n_frames)
+    for reasons in faults.values():
+        for t, reason in reasons.items():
+            failures[t] += 0.01 if reason == EMPTY else 1.0
     chosen = []
     for part in np.array_split(np.arange(n_frames), min(columns, n_frames)):
-        worst = part[count[part] == count[part].max()]
+        worst = part[failures[part] == failures[part].max()]
         middle = part[len(part) // 2]
         chosen.append(int(worst[np.argmin(np.abs(worst - middle))]))
     return chosen
@@ -129,12 +129,12 @@ def _drawn(cell: SheetCell, width: int, height: int) -> NDArray[np.uint8]:
     """A cell with its border and, under it, the reason for a fault."""
     canvas = np.full((height + 2 * _BORDER + _CAPTION, width + 2 * _BORDER, 3), PAPER, np.uint8)
     image, mask = thumbnail(cell.image, cell.mask, width, height)
-    shown = outlined(image, mask)
+    picture = outlined(image, mask)
     if cell.fault:
-        canvas[: shown.shape[0] + 2 * _BORDER, : shown.shape[1] + 2 * _BORDER] = FAULT
-        caption = canvas[shown.shape[0] + 2 * _BORDER :][:_CAPTION]
+        canvas[: picture.shape[0] + 2 * _BORDER, : picture.shape[1] + 2 * _BORDER] = FAULT
+        caption = canvas[picture.shape[0] + 2 * _BORDER :][:_CAPTION]
         write_line(caption, _BORDER, 1, cell.fault, size=12, colour=FAULT, bold=True, room=width)
-    canvas[_BORDER : _BORDER + shown.shape[0], _BORDER : _BORDER + shown.shape[1]] = shown
+    canvas[_BORDER : _BORDER + picture.shape[0], _BORDER : _BORDER + picture.shape[1]] = picture
     return canvas
 
 
@@ -182,11 +182,11 @@ def sheet_of_set(
     return sheet, faults, remarks
 
 
-def fault_note(found: Mapping[int, str], n_frames: int) -> str:
+def fault_note(reasons: Mapping[int, str], n_frames: int) -> str:
     """A camera's faults in a few words, on up to three lines."""
-    empty = sum(reason == EMPTY for reason in found.values())
-    lines = [f"of {n_frames} masks", f"{empty} empty", f"{len(found) - empty} failed"]
-    return "\n".join(lines) if found else f"{n_frames} masks,\nno fault seen"
+    empty = sum(reason == EMPTY for reason in reasons.values())
+    lines = [f"of {n_frames} masks", f"{empty} empty", f"{len(reasons) - empty} failed"]
+    return "\n".join(lines) if reasons else f"{n_frames} masks,\nno fault seen"
 
 
 def _read_mask(path: str | None, shape: tuple[int, int] | None) -> Mask:

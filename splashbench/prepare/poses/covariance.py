@@ -37,12 +37,12 @@ class PoseSigmas:
 def pose_sigmas(
     reconstruction: pycolmap.Reconstruction,
     names: Sequence[str],
-    held_cameras: Set[int],
+    fixed_lenses: Set[int],
     principal_point_refined: bool = False,
 ) -> PoseSigmas | None:
     """Standard deviations of the poses of the images `names`, relative to each other (see above).
 
-    `held_cameras`: COLMAP's numbers of the cameras whose intrinsics were not refined; `principal_point_refined`:
+    `fixed_lenses`: COLMAP's numbers of the cameras whose intrinsics were not refined; `principal_point_refined`:
     whether that of the others was. None where fewer than two of the images have a pose, or where the observations do
     not determine them.
     """
@@ -50,7 +50,7 @@ def pose_sigmas(
     chosen = [index for index, image in enumerate(images) if image.name in set(names)]
     if len(chosen) < 2 or not reconstruction.points3D:
         return None
-    normal, variance = _reduced_normal_matrix(reconstruction, images, held_cameras, principal_point_refined)
+    normal, variance = _reduced_normal_matrix(reconstruction, images, fixed_lenses, principal_point_refined)
     if normal is None:
         return None
     centres = np.array([-_rotation(image).T @ _translation(image) for image in images])
@@ -82,7 +82,7 @@ def pose_sigmas(
 def _reduced_normal_matrix(
     reconstruction: pycolmap.Reconstruction,
     images: Sequence[pycolmap.Image],
-    held_cameras: Set[int],
+    fixed_lenses: Set[int],
     principal_point_refined: bool,
 ) -> tuple[Array | None, float]:
     """J^T J of the poses (rotation, then centre, 6 each) and refined intrinsics, points eliminated; and the
@@ -90,7 +90,7 @@ def _reduced_normal_matrix(
     numbers = {key: index for index, key in enumerate(reconstruction.points3D)}
     refined: dict[int, tuple[int, list[int]]] = {}  # camera -> first column, its refined parameters
     n_columns = 6 * len(images)
-    for camera_id in sorted({image.camera_id for image in images} - held_cameras):
+    for camera_id in sorted({image.camera_id for image in images} - fixed_lenses):
         camera = reconstruction.cameras[camera_id]
         principal = () if principal_point_refined else _PRINCIPAL[camera.model.name]
         free = [index for index in range(len(camera.params)) if index not in principal]

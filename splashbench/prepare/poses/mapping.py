@@ -46,7 +46,7 @@ class Workplace:
 
     folder: Path
     names: Mapping[str, str]  # fixed camera -> image name
-    held_cameras: frozenset[int]  # COLMAP's numbers of the cameras whose lens is known
+    fixed_lenses: frozenset[int]  # COLMAP's numbers of the cameras whose lens is known
     threads: int
 
     @property
@@ -64,7 +64,7 @@ class Mapped:
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """COLMAP logs hundreds of lines to standard error; only its errors are left to see."""
+    """COLMAP logs hundreds of lines to standard error; only its errors stay."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     try:
@@ -93,14 +93,14 @@ def match(
         write_png(folder / "images" / name, image)
     pycolmap.set_random_seed(SEED)
 
-    known = [names[camera] for camera in fixed if camera in lenses]
-    unknown = [names[camera] for camera in fixed if camera not in lenses]
+    calibrated = [names[camera] for camera in fixed if camera in lenses]
+    uncalibrated = [names[camera] for camera in fixed if camera not in lenses]
     width = max(image.shape[1] for image in [*fixed.values(), *sweep[:1]])
     extract = _extractor(folder, width, threads)
-    if known:
-        extract(known, pycolmap.CameraMode.PER_IMAGE, FIXED_MODEL, None)
-    if unknown:
-        extract(unknown, pycolmap.CameraMode.PER_IMAGE, UNKNOWN_MODEL, None)
+    if calibrated:
+        extract(calibrated, pycolmap.CameraMode.PER_IMAGE, FIXED_MODEL, None)
+    if uncalibrated:
+        extract(uncalibrated, pycolmap.CameraMode.PER_IMAGE, UNKNOWN_MODEL, None)
     if sweep:
         height, width = sweep[0].shape[:2]
         focal = sweep_focal or DEFAULT_FOCAL * max(width, height)
@@ -148,7 +148,7 @@ def _extractor(
 
 def _write_lenses(database: Path, names: Mapping[str, str], lenses: Mapping[str, Lens]) -> frozenset[int]:
     """Write the known lenses into the database; returns the numbers of their cameras there."""
-    held = set()
+    fixed = set()
     with pycolmap.Database.open(database) as opened:
         by_name = {image.name: image for image in opened.read_all_images()}
         for camera, name in names.items():
@@ -159,8 +159,8 @@ def _write_lenses(database: Path, names: Mapping[str, str], lenses: Mapping[str,
             record.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
             record.has_prior_focal_length = True
             opened.update_camera(record)
-            held.add(record.camera_id)
-    return frozenset(held)
+            fixed.add(record.camera_id)
+    return frozenset(fixed)
 
 
 def map_images(workplace: Workplace) -> Mapped | None:
@@ -168,19 +168,19 @@ def map_images(workplace: Workplace) -> Mapped | None:
     search, all, that is, that share enough matches with any other image. None where no attempt gave any."""
     pairs = _verified_pairs(workplace)
     matched = {name for _, *both in pairs for _, name in both}
-    wanted = len(matched.intersection(workplace.names.values()))
+    reachable = len(matched.intersection(workplace.names.values()))
     best: tuple[tuple[int, int], pycolmap.Reconstruction] | None = None
     attempts: list[str] = []
     for label, options in _attempts(workplace, pairs):
         output = workplace.folder / f"sparse{len(attempts)}"
         output.mkdir()
-        found = pycolmap.incremental_mapping(workplace.database, workplace.folder / "images", output, options).values()
-        ranked = [(_merit(model, workplace), model) for model in found]
+        models = pycolmap.incremental_mapping(workplace.database, workplace.folder / "images", output, options).values()
+        ranked = [(_merit(model, workplace), model) for model in models]
         top = max(ranked, key=lambda pair: pair[0], default=((0, 0), None))
         attempts.append(f"{label}: {top[0][0]} of {len(workplace.names)} fixed cameras, {top[0][1]} images in all")
         if top[1] is not None and (best is None or top[0] > best[0]):
             best = top
-        if best is not None and best[0][0] >= wanted:
+        if best is not None and best[0][0] >= reachable:
             break
     return None if best is None else Mapped(best[1], tuple(attempts))
 
@@ -215,19 +215,19 @@ def _attempts(
 
 
 def _mapping_options(workplace: Workplace, level: int) -> pycolmap.IncrementalPipelineOptions:
-    """Known lenses held, one seed everywhere; `level` 0 has COLMAP's thresholds, 1 lower ones."""
+    """Known lenses fixed, one seed everywhere; `level` 0 has COLMAP's thresholds, 1 lower ones."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = workplace.threads
     options.random_seed = SEED
     options.mapper.random_seed = SEED
     options.triangulation.random_seed = SEED
-    options.constant_cameras = set(workplace.held_cameras)
+    options.constant_cameras = set(workplace.fixed_lenses)
     options.min_model_size = 3
     options.mapper.init_min_num_inliers = INLIERS[level]
     options.mapper.init_min_tri_angle = ANGLE[level]
     options.mapper.abs_pose_min_num_inliers = ADDED_INLIERS[level]
     # COLMAP takes large distortion coefficients for a sign of a bad guess; these have been measured.
-    if workplace.held_cameras:
+    if workplace.fixed_lenses:
         for limited in (options, options.mapper, options.triangulation):
             limited.max_extra_param = MAX_COEFFICIENT
     # Registering an image may not bend its lens; the sweep's is refined by bundle adjustment instead.
@@ -255,10 +255,10 @@ def refine(reconstruction: pycolmap.Reconstruction, workplace: Workplace) -> boo
         camera_id = reconstruction.images[image_id].camera_id
         n_images[camera_id] = n_images.get(camera_id, 0) + 1
     for camera_id in n_images:
-        if camera_id in workplace.held_cameras:
+        if camera_id in workplace.fixed_lenses:
             config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    refined = [count for camera_id, count in n_images.items() if camera_id not in workplace.held_cameras]
+    refined = [count for camera_id, count in n_images.items() if camera_id not in workplace.fixed_lenses]
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = bool(refined) and min(refined) >= MIN_FOR_PRINCIPAL_POINT
     options.print_summary = False

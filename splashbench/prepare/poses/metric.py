@@ -1,9 +1,9 @@
 """Metres and gravity from a print lying flat on the table in the static scene: the ChArUco board, or a marker.
 
-Structure from motion knows neither scale nor up. The print's corners, triangulated from the posed cameras, are
-aligned with their known places on it by the closed form of Umeyama (IEEE TPAMI 13(4), 1991). The scene frame
-follows from the print: origin at its centre, metres, +y up (the print's normal, so gravity is (0, -1, 0)), +x along
-its upper edge as printed, right-handed. Which print, or what else, gives what: `scale`.
+Structure from motion knows neither scale nor up. The print's corners are triangulated from the posed cameras, and
+aligned with their known places on it (`umeyama`). The scene frame follows from the print: origin at its centre, metres,
++y up (the print's normal, so gravity is (0, -1, 0)), +x along its upper edge as printed, right-handed. `scale` decides
+which print gives what, and what else may.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.alignment import Similarity, triangulate, umeyama
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardView, Detector
 from splashbench.prepare.calibration.lens import Array, Lens
@@ -25,26 +26,6 @@ MIN_TRIANGULATED = 6
 # A corner further off than this many times the typical residual was misread in some view.
 OUTLIER_FACTOR = 4.0
 MAX_DISAGREEMENT_PX = 5.0  # of true sightings, in frames of any size; a false one is off by tens of pixels
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """x -> scale * rotation @ x + translation."""
-
-    scale: float
-    rotation: Array  # [3, 3]
-    translation: Array  # [3]
-
-    def apply(self, points: Array) -> Array:
-        """Map points [N, 3]."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def apply_w2c(self, w2c: Array) -> Array:
-        """World-to-camera [4, 4] of the same camera in the mapped world; depths grow by `scale`."""
-        mapped = np.eye(4)
-        mapped[:3, :3] = w2c[:3, :3] @ self.rotation.T
-        mapped[:3, 3] = self.scale * w2c[:3, 3] - mapped[:3, :3] @ self.translation
-        return mapped
 
 
 @dataclass(frozen=True)
@@ -62,37 +43,6 @@ class MetricFrame:
     board_diagonal_m: float
     corners: Array  # [n_corners, 3] triangulated corners in the scene frame, metres
     scale_sigma: float = 0.0
-
-
-def umeyama(source: Array, target: Array) -> Similarity:
-    """The similarity that maps source [N, 3] onto target [N, 3] with the least squared error; never a reflection."""
-    mean_source, mean_target = source.mean(0), target.mean(0)
-    a, b = source - mean_source, target - mean_target
-    u, singular, vt = np.linalg.svd(b.T @ a / len(a))
-    # For points in a plane the smallest singular value is zero, and the sign alone decides against the mirror image.
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ np.diag(signs) @ vt
-    scale = float((singular * signs).sum() / (a**2).sum(1).mean())
-    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
-
-
-def triangulate(rays: Array, w2c: Array) -> Array:
-    """The point [3] seen along normalised coordinates [V, 2] by cameras [V, 4, 4], V >= 2.
-
-    Linear triangulation, repeated with each row divided by the point's depth so that it minimises the image error.
-    """
-    weights = np.ones(len(rays))
-    point = np.zeros(3)
-    for _ in range(4):
-        rows = np.concatenate(
-            [
-                (rays[:, :1] * w2c[:, 2] - w2c[:, 0]) * weights[:, None],
-                (rays[:, 1:] * w2c[:, 2] - w2c[:, 1]) * weights[:, None],
-            ]
-        )
-        point = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rcond=None)[0]
-        weights = 1.0 / np.maximum(np.abs(w2c[:, 2, :3] @ point + w2c[:, 2, 3]), 1e-9)
-    return point
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,29 +109,32 @@ def align_print(sightings: Sequence[Sighting], flat: Print, upright: bool = True
     upright: whether it does; where only its size is of interest, it may stand or hang anywhere.
     Raises SplashbenchError where too few corners are seen twice, or where the cameras end up below the table.
     """
-    seen: dict[int, list[tuple[Array, Array]]] = {}
+    rays_of: dict[int, list[tuple[Array, Array]]] = {}
     for sighting in sightings:
         rays = sighting.lens.normalise(sighting.view.pixels)
         for number, ray in zip(sighting.view.ids.tolist(), rays):
-            seen.setdefault(number, []).append((ray, sighting.w2c))
-    numbers = sorted(number for number, rays in seen.items() if len(rays) >= 2)
+            rays_of.setdefault(number, []).append((ray, sighting.w2c))
+    numbers = sorted(number for number, rays in rays_of.items() if len(rays) >= 2)
     if len(numbers) < flat.needed:
         raise SplashbenchError(
             f"static clips and sweep: {len(numbers)} corners of the {flat.name} are seen twice, {flat.needed} are"
             f" needed for metres and gravity; lay the {flat.name} flat where several cameras see it"
         )
     sfm = np.array(
-        [triangulate(np.array([ray for ray, _ in seen[n]]), np.array([pose for _, pose in seen[n]])) for n in numbers]
+        [
+            triangulate(np.array([ray for ray, _ in rays_of[n]]), np.array([pose for _, pose in rays_of[n]]))
+            for n in numbers
+        ]
     )
     printed = flat.scene_points(numbers)
-    kept = np.ones(len(numbers), bool)
+    inliers = np.ones(len(numbers), bool)
     for _ in range(3):
-        similarity = umeyama(sfm[kept], printed[kept])
+        similarity = umeyama(sfm[inliers], printed[inliers])
         residual = np.linalg.norm(similarity.apply(sfm) - printed, axis=1)
-        inliers = residual <= OUTLIER_FACTOR * max(float(np.median(residual)), 1e-9)
-        if inliers.sum() < flat.needed or np.array_equal(inliers, kept):
+        within = residual <= OUTLIER_FACTOR * max(float(np.median(residual)), 1e-9)
+        if within.sum() < flat.needed or np.array_equal(within, inliers):
             break
-        kept = inliers
+        inliers = within
     above = [similarity.apply_w2c(sighting.w2c) for sighting in sightings]
     heights = [float(-(pose[:3, :3].T @ pose[:3, 3])[1]) for pose in above]
     if upright and np.median(heights) <= 0:
@@ -189,47 +142,50 @@ def align_print(sightings: Sequence[Sighting], flat: Print, upright: bool = True
             f"static clips: the cameras come out below the {flat.name}; lay it face up, and {flat.remedy} in"
             " session.toml"
         )
-    rms = float(np.sqrt(np.mean(residual[kept] ** 2)))
-    spread = float(np.sqrt(((printed[kept] - printed[kept].mean(0)) ** 2).sum()))
+    rms = float(np.sqrt(np.mean(residual[inliers] ** 2)))
+    spread = float(np.sqrt(((printed[inliers] - printed[inliers].mean(0)) ** 2).sum()))
     return MetricFrame(
         scene_from_sfm=similarity,
         rms_m=rms,
-        n_corners=int(kept.sum()),
+        n_corners=int(inliers.sum()),
         n_views=len(sightings),
         board_diagonal_m=flat.diagonal,
-        corners=similarity.apply(sfm[kept]),
-        # Of a line through the corners' known against their found places, each axis with the same error.
+        corners=similarity.apply(sfm[inliers]),
+        # Of a line through the corners' triangulated against their printed places, each axis with the same error.
         scale_sigma=rms / np.sqrt(3) / spread,
     )
 
 
 def agreeing(sightings: Sequence[Sighting]) -> list[Sighting]:
-    """The sightings of a print that agree on where it lies. A small marker's pattern is sometimes found where there is
-    none: while they disagree, the sighting is taken away without which the others agree best."""
-    kept = list(sightings)
-    while len(kept) > 2 and _disagreement(kept) > MAX_DISAGREEMENT_PX:
-        without = [_disagreement(kept[:index] + kept[index + 1 :]) for index in range(len(kept))]
-        del kept[int(np.argmin(without))]
-    return kept
+    """The sightings of a print that agree on where it lies.
+
+    A small marker's pattern is sometimes detected where there is none. While the sightings disagree, the one is dropped
+    without which the others agree best.
+    """
+    agreed = list(sightings)
+    while len(agreed) > 2 and _disagreement(agreed) > MAX_DISAGREEMENT_PX:
+        disagreements = [_disagreement(agreed[:index] + agreed[index + 1 :]) for index in range(len(agreed))]
+        del agreed[int(np.argmin(disagreements))]
+    return agreed
 
 
 def _disagreement(sightings: Sequence[Sighting]) -> float:
     """The largest RMS distance in pixels of a sighting's corners to those that all sightings triangulate together."""
     rays = [dict(zip(s.view.ids.tolist(), s.lens.normalise(s.view.pixels))) for s in sightings]
     squares: list[list[float]] = [[] for _ in sightings]
-    for number in sorted({number for found in rays for number in found}):
-        seen = [index for index, found in enumerate(rays) if number in found]
-        if len(seen) < 2:
+    for number in sorted({number for corners in rays for number in corners}):
+        viewers = [index for index, corners in enumerate(rays) if number in corners]
+        if len(viewers) < 2:
             continue
-        point = triangulate(np.array([rays[k][number] for k in seen]), np.array([sightings[k].w2c for k in seen]))
-        for index in seen:
+        point = triangulate(np.array([rays[k][number] for k in viewers]), np.array([sightings[k].w2c for k in viewers]))
+        for index in viewers:
             sighting = sightings[index]
             local = sighting.w2c[:3, :3] @ point + sighting.w2c[:3, 3]
             if local[2] <= 0:
                 return float("inf")
             pixel = sighting.view.pixels[sighting.view.ids == number][0]
             squares[index].append(float(((sighting.lens.project(local[None])[0] - pixel) ** 2).sum()))
-    return max((float(np.sqrt(np.mean(own))) for own in squares if own), default=0.0)
+    return max((float(np.sqrt(np.mean(errors))) for errors in squares if errors), default=0.0)
 
 
 def transformed(poses: Poses, similarity: Similarity) -> Poses:

@@ -89,8 +89,8 @@ class RigRecordings:
     def pose(self, lenses: Mapping[str, Lens], work: Path) -> PosedRig:
         """Structure from motion of the static scene, and where it shows the board; `work` is an empty folder."""
         static = self.static_images()
-        found, sweep = solve_poses(static, self.sweep_images, lenses, self.detector, work)
-        return sight_prints(static, sweep, lenses, found, self.session, self.detector)
+        posed, sweep = solve_poses(static, self.sweep_images, lenses, self.detector, work)
+        return sight_prints(static, sweep, lenses, posed, self.session, self.detector)
 
     def check_sizes(self, lenses: Mapping[str, Lens], others: Mapping[str, Recording]) -> None:
         """Raise SplashbenchError where a camera recorded at another size than its lens was calibrated at."""
@@ -139,30 +139,30 @@ def solve_poses(
         if len(more) <= len(sweep):
             raise
         second.mkdir()
-        found = find_poses(static, more, lenses, detector, second)
+        solved = find_poses(static, more, lenses, detector, second)
         failed = f"{len(sweep)} frames of the sweep: {error}"
-        return replace(found, attempts=(failed, *found.attempts)), more
+        return replace(solved, attempts=(failed, *solved.attempts)), more
 
 
 def sight_prints(
     static: Mapping[str, Image],
     sweep: Sequence[Image],
     lenses: Mapping[str, Lens],
-    found: poses.Poses,
+    posed: poses.Poses,
     session: Session,
     detector: Detector,
 ) -> PosedRig:
     """The board, and the marker where session.toml describes one, in the static pictures and the posed sweep."""
-    board = _sightings(static, sweep, lenses, found, detector.detect_true)
+    board = _sightings(static, sweep, lenses, posed, detector.detect_true)
     if board:
         # A checkerboard numbers its corners from either end; for a ChArUco board nothing changes.
-        alike = numbered_alike([s.view for s in board], [s.lens for s in board], [s.w2c for s in board], detector)
-        board = [replace(sighting, view=view) for sighting, view in zip(board, alike)]
+        renumbered = numbered_alike([s.view for s in board], [s.lens for s in board], [s.w2c for s in board], detector)
+        board = [replace(sighting, view=view) for sighting, view in zip(board, renumbered)]
     marker: list[metric.Sighting] = []
     if session.marker is not None:
-        wanted = MarkerDetector(session.marker)
-        marker = metric.agreeing(_sightings(static, sweep, lenses, found, wanted.detect))
-    return PosedRig(found, tuple(board), tuple(marker))
+        marker_detector = MarkerDetector(session.marker)
+        marker = metric.agreeing(_sightings(static, sweep, lenses, posed, marker_detector.detect))
+    return PosedRig(posed, tuple(board), tuple(marker))
 
 
 def prints_are_seen(rig: PosedRig, session: Session, detector: Detector) -> bool:
@@ -198,10 +198,10 @@ def _sightings(
     static: Mapping[str, Image],
     sweep: Sequence[Image],
     lenses: Mapping[str, Lens],
-    found: poses.Poses,
+    posed: poses.Poses,
     detect: Callable[[Image], BoardView | None],
 ) -> list[metric.Sighting]:
-    candidates = [(image, lenses[camera], found.w2c[camera]) for camera, image in static.items()]
-    candidates += [(sweep[index], found.sweep_lens, w2c) for index, w2c in zip(found.sweep_indices, found.sweep_w2c)]
+    candidates = [(image, lenses[camera], posed.w2c[camera]) for camera, image in static.items()]
+    candidates += [(sweep[index], posed.sweep_lens, w2c) for index, w2c in zip(posed.sweep_indices, posed.sweep_w2c)]
     views = [(detect(image), lens, w2c) for image, lens, w2c in candidates]
     return [metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None]

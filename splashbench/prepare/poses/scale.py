@@ -18,9 +18,10 @@ from typing import Literal
 
 import numpy as np
 
+from splashbench.alignment import Similarity
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.lens import Array
-from splashbench.prepare.poses.metric import MetricFrame, Similarity
+from splashbench.prepare.poses.metric import MetricFrame
 from splashbench.prepare.poses.structure_from_motion import Poses
 
 Source = Literal["board", "marker", "distance", "container"]

@@ -109,7 +109,7 @@ def estimate_poses(
             principal = refine(mapped.reconstruction, workplace)
             bar.update(0.9, "deviations")
             names = list(workplace.names.values())
-            sigmas = pose_sigmas(mapped.reconstruction, names, workplace.held_cameras, principal)
+            sigmas = pose_sigmas(mapped.reconstruction, names, workplace.fixed_lenses, principal)
             bar.update(1.0)
     finally:
         bar.close()

@@ -1,9 +1,9 @@
 """When the liquid moves: the part of a recording to be sampled (paper Sec. 3, "interval of effective liquid motion").
 
-Seen, not heard: the clap that helps synchronisation comes before the pour. Frames are compared in luma,
-shrunk by area. Motion begins where the picture departs from its static beginning; it ends where successive
-frames stop differing, since liquid at rest in a container does not look like the beginning. Both count pixels
-beyond the noise that the static beginning itself shows, after taking out changes of the overall brightness.
+Images decide, not sound: the clap that helps synchronisation comes before the pour. Frames are compared in luma, shrunk
+by area. Motion begins where the picture departs from its static beginning. It ends where successive frames stop
+differing, since liquid at rest in a container does not look like the beginning. Both count pixels beyond the noise of
+the static beginning, after changes of the overall brightness are taken out.
 """
 
 from __future__ import annotations

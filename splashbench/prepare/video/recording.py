@@ -15,6 +15,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+# PyAV, not imageio: that numbers frames, but tells neither their timestamps nor where chapters and key frames begin,
+# and reads no sound. Clocks and exact seeking need all of these.
 import av
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +35,13 @@ _COPY_AGAIN = "copy it from the camera again"
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video file says about itself; width and height as shown, after its rotation tag.
+    """What a video file states of itself.
 
-    `duration` and `start_time` in seconds (of the video stream), `n_frames` as promised by the container
-    (counted, for a `Recording`), `audio_minus_video_s`: how much longer the audio stream is than the video
-    stream, None without audio.
+    Attributes:
+        width, height: as shown, after the file's rotation tag.
+        n_frames: as the container promises; counted, for a `Recording`.
+        duration, start_time: of the video stream, seconds.
+        audio_minus_video_s: how much longer the audio stream is than the video stream; None without audio.
     """
 
     width: int
@@ -122,9 +126,9 @@ def _scan(path: Path) -> _Chapter:
     last_duration = discarded = 0
     with open_media(path) as container:
         stream = _video_stream(container, path)
-        base = float(stream.time_base)
+        seconds_per_tick = float(stream.time_base)
         rate = float(stream.average_rate or 0)
-        promised = stream.frames or (round(stream.duration * base * rate) if stream.duration else 0)
+        promised = stream.frames or (round(stream.duration * seconds_per_tick * rate) if stream.duration else 0)
         for packet in container.demux(stream):
             if packet.size == 0 or packet.is_corrupt:
                 continue
@@ -139,15 +143,17 @@ def _scan(path: Path) -> _Chapter:
             if packet.is_keyframe and _is_clean_entry(bytes(packet), stream.codec_context):
                 entries.append(packet.pts)
     ordered = np.sort(np.asarray(pts, np.int64))
-    found = len(ordered) + discarded
-    if found < promised - _MISSING_FRAMES_TOLERATED or not len(ordered):
-        raise SplashbenchError(f"{path} is cut short: {found} frames of the {promised} promised; {_COPY_AGAIN}")
+    n_read = len(ordered) + discarded
+    if n_read < promised - _MISSING_FRAMES_TOLERATED or not len(ordered):
+        raise SplashbenchError(f"{path} is cut short: {n_read} frames of the {promised} promised; {_COPY_AGAIN}")
     gaps = np.diff(ordered)
     if (gaps == 0).any():
         raise SplashbenchError(f"{path} has two frames with the same timestamp; {_COPY_AGAIN}")
     tail = last_duration or (int(np.median(gaps)) if len(gaps) else 0)
-    duration = float(ordered[-1] - ordered[0] + tail) * base
-    return _Chapter(path, ordered, base, duration, np.searchsorted(ordered, np.sort(np.asarray(entries, np.int64))))
+    duration = float(ordered[-1] - ordered[0] + tail) * seconds_per_tick
+    return _Chapter(
+        path, ordered, seconds_per_tick, duration, np.searchsorted(ordered, np.sort(np.asarray(entries, np.int64)))
+    )
 
 
 def _is_clean_entry(data: bytes, codec: Any) -> bool:
@@ -199,19 +205,23 @@ class Recording:
     @cached_property
     def info(self) -> VideoInfo:
         """Facts of the whole recording; frames are counted. Raises SplashbenchError when chapters do not match."""
-        facts = [probe(path) for path in self.paths]
-        for path, other in zip(self.paths, facts):
-            if (other.width, other.height, other.codec) != (facts[0].width, facts[0].height, facts[0].codec):
+        chapters = [probe(path) for path in self.paths]
+        for path, chapter in zip(self.paths, chapters):
+            if (chapter.width, chapter.height, chapter.codec) != (
+                chapters[0].width,
+                chapters[0].height,
+                chapters[0].codec,
+            ):
                 raise SplashbenchError(
                     f"{path} differs in size or codec from {self.paths[0]}; list chapters of one recording only"
                 )
-        longer = [fact.audio_minus_video_s for fact in facts if fact.audio_minus_video_s is not None]
+        audio_excess = [chapter.audio_minus_video_s for chapter in chapters if chapter.audio_minus_video_s is not None]
         return replace(
-            facts[0],
+            chapters[0],
             n_frames=int(self._first_indices[-1]),
             duration=float(self._offsets[-1]),
-            has_audio=all(fact.has_audio for fact in facts),
-            audio_minus_video_s=float(sum(longer)) if len(longer) == len(facts) else None,
+            has_audio=all(chapter.has_audio for chapter in chapters),
+            audio_minus_video_s=float(sum(audio_excess)) if len(audio_excess) == len(chapters) else None,
         )
 
     @cached_property
@@ -232,12 +242,12 @@ class Recording:
         cannot be decoded.
         """
         total = int(self._first_indices[-1])
-        wanted = np.arange(total) if indices is None else np.unique(np.fromiter(indices, np.int64))
-        if len(wanted) and not 0 <= wanted[0] <= wanted[-1] < total:
+        indices_wanted = np.arange(total) if indices is None else np.unique(np.fromiter(indices, np.int64))
+        if len(indices_wanted) and not 0 <= indices_wanted[0] <= indices_wanted[-1] < total:
             raise ValueError(f"frame indices must lie in 0..{total - 1}")
         for number, chapter in enumerate(self._chapters):
             first, stop = self._first_indices[number : number + 2]
-            local = wanted[(wanted >= first) & (wanted < stop)] - first
+            local = indices_wanted[(indices_wanted >= first) & (indices_wanted < stop)] - first
             for run in _runs(local, chapter.entries):
                 chosen = iter(run)
                 expected = next(chosen)
@@ -288,13 +298,13 @@ class Recording:
         return self._audio[rate]
 
 
-def _runs(wanted: NDArray[np.int64], entries: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _runs(indices: NDArray[np.int64], entries: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Split frame indices where starting the decoder anew saves work."""
-    if not len(wanted):
+    if not len(indices):
         return []
-    entry = entries[np.searchsorted(entries, wanted, side="right") - 1] if len(entries) else np.zeros_like(wanted)
-    saved = entry[1:] - wanted[:-1]
-    return np.split(wanted, np.flatnonzero(saved > _WORTH_SEEKING_FRAMES) + 1)
+    entry_of = entries[np.searchsorted(entries, indices, side="right") - 1] if len(entries) else np.zeros_like(indices)
+    saved = entry_of[1:] - indices[:-1]
+    return np.split(indices, np.flatnonzero(saved > _WORTH_SEEKING_FRAMES) + 1)
 
 
 def _decode(chapter: _Chapter, first: int, last: int, keyframes: bool = False) -> Iterator[tuple[int, Any]]:

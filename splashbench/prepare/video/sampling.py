@@ -1,9 +1,8 @@
 """The timesteps of a scene: instants spread evenly over the motion, and each camera's source frame nearest to them.
 
-The paper takes 50 timesteps over the motion interval (Sec. 3); the step is no whole number of source frames
-(Supp., "Scene Overview"), so every camera's frames lie up to half a source frame beside the wanted instant.
-What is kept is the true time of every frame on the reference clock, per camera, and their mean as the
-timestep's time.
+The paper takes 50 timesteps over the motion interval (Sec. 3). The step is no whole number of source frames (Supp.,
+"Scene Overview"), so every camera's frames lie up to half a source frame beside the nominal instant. A timestep's time
+is the mean of its frames' true times on the reference clock, which are recorded per camera.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splashbench.arrays import Flags, Floats, Indices
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.arrays import Flags, Floats, Indices
 from splashbench.prepare.audio.sync import ClockFit
 
 _ROUNDING_S = 1e-6  # timestamps are whole ticks of the file's time base
@@ -24,10 +23,15 @@ _ROUNDING_S = 1e-6  # timestamps are whole ticks of the file's time base
 class Sampling:
     """Which source frame stands for which timestep, per camera.
 
-    `nominal`: [T] the wanted instants; `times`: [T] the mean of the cameras' true times; `indices[camera]`:
-    [T] source frames; `camera_times[camera]`: [T] their true times; `flagged[camera]`: [T] whether the true
-    time misses the wanted one by more than half a source frame (a dropped frame, or the end of the
-    recording). All times are seconds on the reference clock.
+    All times are seconds on the reference clock.
+
+    Attributes:
+        nominal: [T], instants spread evenly.
+        times: [T], the mean of the cameras' true times.
+        indices: camera -> [T] source frames.
+        camera_times: camera -> [T] their true times.
+        flagged: camera -> [T] whether the true time misses the nominal one by more than half a source frame: a dropped
+            frame, or the end of the recording.
     """
 
     nominal: Floats

@@ -50,10 +50,10 @@ class Stills:
         files: list[Path] = []
         for folder in self.paths:
             try:
-                found = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+                photographs = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
             except OSError as error:
                 raise SplashbenchError(f"{folder} cannot be read as a folder ({error.strerror}); restore it") from None
-            visible = [path for path in found if not path.name.startswith(".")]
+            visible = [path for path in photographs if not path.name.startswith(".")]
             if not visible:
                 raise SplashbenchError(f"{folder} holds no JPEG or PNG photographs; copy them there")
             for path in visible:
@@ -90,10 +90,10 @@ class Stills:
         Raises SplashbenchError when one is damaged or differs in size from the others.
         """
         total = self.info.n_frames
-        wanted = range(total) if indices is None else sorted(set(indices))
-        if len(wanted) and not 0 <= wanted[0] <= wanted[-1] < total:
+        chosen = range(total) if indices is None else sorted(set(indices))
+        if len(chosen) and not 0 <= chosen[0] <= chosen[-1] < total:
             raise ValueError(f"frame indices must lie in 0..{total - 1}")
-        for index in wanted:
+        for index in chosen:
             yield int(index), _read(self.files[index])
 
     def luma(

@@ -1,4 +1,4 @@
-"""Where everything in a made-up capture stands: the bowl or tank, the arc of cameras and the rectangles of the room.
+"""Where everything in a synthetic capture stands: the bowl or tank, the arc of cameras and the rectangles of the room.
 
 World coordinates are metres with y up; the container stands on the table (y = 0) at the origin. The arc follows the
 paper's rig (Sec. 4, "Capture and calibration"): seven cameras over 77 degrees, and the test views lie between

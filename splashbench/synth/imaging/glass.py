@@ -74,7 +74,7 @@ class Glass:
     def along(self, eye: Vectors, directions: Vectors) -> Panes:
         """The walls that rays from `eye` [3] along unit `directions` [R, 3] cross."""
         n = len(directions)
-        found = Panes(
+        panes = Panes(
             np.full((n, WALLS), FAR, np.float32),
             np.ones((n, WALLS, 3), np.float32),
             np.zeros((n, WALLS, 3), np.float32),
@@ -83,21 +83,21 @@ class Glass:
         for k in range(WALLS):
             rays, entry, way_in = self._faces(eye, directions, rays, reach, inwards=True)
             through, leaving, way_out = self._faces(eye, directions, rays, entry + _BEYOND, inwards=False)
-            kept = np.isin(rays, through)
-            rays, entry, way_in = rays[kept], entry[kept], way_in[kept]
+            crossed = np.isin(rays, through)
+            rays, entry, way_in = rays[crossed], entry[crossed], way_in[crossed]
             light = directions[rays]
             first, first_mirrored = _face(light, way_in)
             second, second_mirrored = _face(light, way_out)
             swallowed = np.exp(-ABSORPTION * (leaving - entry)[:, None])
-            found.distance[rays, k] = entry
+            panes.distance[rays, k] = entry
             transmitted = swallowed * (1 - first) * (1 - second)
             # What the far face mirrors crosses the wall twice.
             mirrored = first_mirrored + swallowed**2 * (1 - first) ** 2 * second_mirrored
             ground = self._near_edge(eye + entry[:, None] * light)[:, None]
-            found.transmitted[rays, k] = np.where(ground, _GROUND_CLEAR * transmitted, transmitted)
-            found.mirrored[rays, k] = np.where(ground, mirrored + _GROUND_LIGHT, mirrored)
+            panes.transmitted[rays, k] = np.where(ground, _GROUND_CLEAR * transmitted, transmitted)
+            panes.mirrored[rays, k] = np.where(ground, mirrored + _GROUND_LIGHT, mirrored)
             reach = leaving + _BEYOND
-        return found
+        return panes
 
     def _near_edge(self, points: Vectors) -> NDArray[np.bool_]:
         """Which points [R, 3] lie in the ground strip along an edge."""
@@ -121,8 +121,8 @@ class Glass:
         hits = self._tracer.nearest(eye + reach[:, None] * towards, towards)
         normal = self._normals[np.maximum(hits.triangle, 0)]
         right_way = (np.einsum("ij,ij->i", normal, towards) < 0) == inwards
-        kept = (hits.geometry >= 0) & right_way
-        return rays[kept], (reach + hits.distance)[kept], normal[kept]
+        crossed = (hits.geometry >= 0) & right_way
+        return rays[crossed], (reach + hits.distance)[crossed], normal[crossed]
 
 
 def _sharp_edges(faces: NDArray[np.int32], normals: Vectors) -> NDArray[np.int64]:

@@ -44,19 +44,19 @@ class Tracer:
     def nearest(self, origins: Points, directions: Points) -> Hits:
         """The first thing each ray meets; `origins` and unit `directions` are [R, 3]."""
         origins, directions = _rays(origins, directions)
-        found = self._scene.run(origins, directions, output=True)
-        geometry = found["geomID"].astype(np.int32)
+        hits = self._scene.run(origins, directions, output=True)
+        geometry = hits["geomID"].astype(np.int32)
         missed = geometry < 0
-        normal = found["Ng"].astype(np.float32)
+        normal = hits["Ng"].astype(np.float32)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         normal /= np.where(length > 0, length, 1)
         away = np.einsum("ij,ij->i", normal, directions) > 0
         normal[away] *= -1
-        u, v = found["u"], found["v"]
+        u, v = hits["u"], hits["v"]
         return Hits(
-            distance=np.where(missed, FAR, found["tfar"]).astype(np.float32),
+            distance=np.where(missed, FAR, hits["tfar"]).astype(np.float32),
             geometry=geometry,
-            triangle=found["primID"].astype(np.int32),
+            triangle=hits["primID"].astype(np.int32),
             normal=normal,
             weights=np.stack([1 - u - v, u, v], axis=1),
         )

@@ -1,9 +1,9 @@
 """Images and exact masks of the room and the liquid, by ray casting through the camera's true lens.
 
-The room does not move, so it is cast once per camera (`View`), with every sample's depth and its colour both in light
-and in the liquid's shadow kept. A frame with liquid (`View.with_liquid`) then costs only the rays that can meet the
-liquid, and the table's and bowl's samples that can lie in its shadow. Image and masks come from the same samples.
-A container of glass (`splashbench.synth.imaging.glass`) hides nothing: it is laid over what lies behind it.
+The room does not move, so it is cast once per camera (`RoomView`): every sample's depth, and its colour both in light
+and in the liquid's shadow. A frame with liquid (`RoomView.with_liquid`) then costs only the rays that can meet the
+liquid, and the table's and bowl's samples that can lie in its shadow. Image and masks come from the same samples. A
+container of glass (`splashbench.synth.imaging.glass`) hides nothing: it is laid over what lies behind it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from splashbench.synth.imaging import shading
 from splashbench.synth.imaging.geometry import Mesh
 from splashbench.synth.imaging.glass import Glass
+from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.raycast import FAR, Hits, Tracer
 from splashbench.synth.imaging.room import Room
 from splashbench.synth.imaging.texture import sample, to_srgb
-from splashbench.synth.recording.lens import LensCamera
 
 Vectors = NDArray[np.float32]
 
@@ -40,8 +40,8 @@ class LiquidFrame:
     mask: NDArray[np.bool_]
 
 
-class Stage:
-    """A room ready to be looked at."""
+class TracedRoom:
+    """A room that rays can be cast into."""
 
     def __init__(self, room: Room) -> None:
         self.room = room
@@ -81,32 +81,32 @@ class Stage:
         return (colors[corners] * weights).sum(axis=1), normal
 
 
-class View:
-    """A stage seen by one camera. Arrays of samples are [P, s * s, ...]: P = H * W pixels, and the samples in each."""
+class RoomView:
+    """A room seen by one camera. Arrays of samples are [P, s * s, ...]: P = H * W pixels, and the samples in each."""
 
-    def __init__(self, stage: Stage, camera: LensCamera, samples: int = SAMPLES) -> None:
-        self.stage, self.camera = stage, camera
+    def __init__(self, traced: TracedRoom, camera: LensCamera, samples: int = SAMPLES) -> None:
+        self.traced, self.camera = traced, camera
         height, width, s = camera.height, camera.width, samples
         by_pixel = camera.rays(s).reshape(height, s, width, s, 3).transpose(0, 2, 1, 3, 4)
         self._directions = np.ascontiguousarray(by_pixel).reshape(height * width, s * s, 3)
         self._eye = camera.center.astype(np.float32)
         directions = self._directions.reshape(-1, 3)
-        hits = stage.tracer.nearest(self._eye, directions)
+        hits = traced.tracer.nearest(self._eye, directions)
         hit = hits.geometry >= 0
         # Beyond the room: a ray that met nothing counts as a far, grey, upright wall.
         reach = np.where(hit, hits.distance, 10).astype(np.float32)
         points = np.asarray(self._eye + reach[:, None] * directions, np.float32)
-        albedo, normal = stage.surface(points, hits)
+        albedo, normal = traced.surface(points, hits)
         lifted = points + _OFFSET * hits.normal
         light, shade = shading.matte(albedo, normal)
         light -= shade
         # The sky changes slowly over a surface: one sample of each pixel speaks for all of them.
         middle = slice(s * s // 2, None, s * s)
-        shade *= np.repeat(openness(stage.tracer, lifted[middle]), s * s)[:, None]
-        lit = hit & ~stage.tracer.occluded(lifted, np.broadcast_to(shading.TO_LIGHT, points.shape))
+        shade *= np.repeat(openness(traced.tracer, lifted[middle]), s * s)[:, None]
+        lit = hit & ~traced.tracer.occluded(lifted, np.broadcast_to(shading.TO_LIGHT, points.shape))
         color = shade + np.where(lit[:, None], light, 0)
-        on_bowl = hits.geometry == stage.bowl_index
-        self._panes = stage.glass.along(self._eye, directions) if stage.glass is not None else None
+        on_bowl = hits.geometry == traced.bowl_index
+        self._panes = traced.glass.along(self._eye, directions) if traced.glass is not None else None
         on_container = on_bowl if self._panes is None else self._panes.met
         self._distance = hits.distance.reshape(-1, s * s)
         self._lifted, self._color, self._shade = (a.reshape(-1, s * s, 3) for a in (lifted, color, shade))
@@ -168,12 +168,12 @@ class View:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + np.float32(1e-9)
         lifted = points + _OFFSET * hits.normal[first]
         towards = np.broadcast_to(shading.TO_LIGHT, points.shape)
-        lit = ~(tracer.occluded(lifted, towards) | self.stage.tracer.occluded(lifted, towards))
+        lit = ~(tracer.occluded(lifted, towards) | self.traced.tracer.occluded(lifted, towards))
         wet = first.reshape(color.shape[:2])
-        in_bowl = self.stage.room.bowl is not None
+        in_bowl = self.traced.room.bowl is not None
         openness = shading.bowl_openness(points) if in_bowl else np.ones(len(points), np.float32)
         behind = None
-        if self.stage.room.clear_liquid:
+        if self.traced.room.clear_liquid:
             light = color[wet]
             if self._panes is not None:
                 panes = self._panes.of(self._samples_of(pixels)[first])

@@ -1,4 +1,4 @@
-"""The room of a made-up capture: textured table and walls, bowl or tank; for the static scene clutter and the board."""
+"""A synthetic capture's room: textured table and walls, bowl or tank; in the static scene clutter and the board."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def check_packages() -> None:
     for package in _PACKAGES:
         if importlib.util.find_spec(package) is None:
             raise SplashbenchError(
-                f"made-up liquids need the package {package}, which is missing; "
+                f"synthetic liquids need the package {package}, which is missing; "
                 "install it with: pip install 'splashbench[synth]'"
             )
 

@@ -1,9 +1,9 @@
-"""What the microphones hear: a clap, the pour and each room's own noise, with exact delays.
+"""What the microphones record: a clap, the pour and each camera's background noise, with exact delays.
 
-The clap and the pour are made once on the common clock at 48 kHz, band-limited, and every camera's track is that
-signal read off at the instants its own clock samples, less the time the sound has travelled (windowed-sinc
-interpolation, so a delay of any fraction of a sample is exact). Colouring and reflections differ between cameras but
-leave the direct sound's delay alone.
+The clap and the pour are made once on the common clock at 48 kHz, band-limited. A camera's track is that signal, read
+at the instants that its clock samples, less the time that the sound has travelled. Windowed-sinc interpolation makes a
+delay of any fraction of a sample exact. Colouring and reflections differ between cameras, but leave the direct sound's
+delay alone.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ Array = NDArray[np.float64]
 
 SAMPLE_RATE = 48000
 SPEED_OF_SOUND = 343.0  # m/s at 20 degrees Celsius
-# Band of the made-up sounds: AAC keeps it at our bit rate, and the interpolation kernel is exact in it.
+# Band of the synthetic sounds: AAC keeps it at our bit rate, and the interpolation kernel is exact in it.
 _BAND_HZ = (120.0, 14000.0)
 _KERNEL_HALF_WIDTH = 24
 _KERNEL_BETA = 9.0
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class SoundSource:
     """A sound: `samples` [n] at 48 kHz from the common time `start_s`, coming from `position` [3], metres, world."""
 
     samples: Array
@@ -44,17 +44,17 @@ class Microphone:
     seed: tuple[int, ...] = field(default=(0,))
 
 
-def clap(rng: np.random.Generator, at_s: float, position: Array) -> Source:
+def clap(rng: np.random.Generator, at_s: float, position: Array) -> SoundSource:
     """A hand clap at common time `at_s`: a sharp band-limited burst that dies out within 50 ms."""
     length = int(0.12 * SAMPLE_RATE)
     lead = int(0.01 * SAMPLE_RATE)
     t = (np.arange(length) - lead) / SAMPLE_RATE
     decay = np.where(t < 0, 0.0, 0.75 * np.exp(-t / 0.0035) + 0.25 * np.exp(-t / 0.012))
     burst = band_limit(rng.standard_normal(length) * decay, 500.0, 12000.0)
-    return Source(burst / np.abs(burst).max(), at_s - lead / SAMPLE_RATE, position)
+    return SoundSource(burst / np.abs(burst).max(), at_s - lead / SAMPLE_RATE, position)
 
 
-def pouring(rng: np.random.Generator, start_s: float, end_s: float, position: Array) -> Source:
+def pouring(rng: np.random.Generator, start_s: float, end_s: float, position: Array) -> SoundSource:
     """The noise of a stream hitting a pool between two common times: hiss with a fluttering loudness, and bubbles."""
     length = int((end_s - start_s) * SAMPLE_RATE)
     t = np.arange(length) / SAMPLE_RATE
@@ -70,10 +70,10 @@ def pouring(rng: np.random.Generator, start_s: float, end_s: float, position: Ar
         sound += rng.uniform(0.3, 1.2) * ringing
     ramp = np.clip(np.minimum(t / 0.15, (t[-1] - t) / 0.3), 0, 1)
     sound = band_limit(sound * ramp, *_BAND_HZ)
-    return Source(0.12 * sound / sound.std(), start_s, position)
+    return SoundSource(0.12 * sound / sound.std(), start_s, position)
 
 
-def record(microphone: Microphone, sources: list[Source], seconds: float) -> NDArray[np.float32]:
+def record(microphone: Microphone, sources: list[SoundSource], seconds: float) -> NDArray[np.float32]:
     """The microphone's track [n] in [-1, 1] over the first `seconds` of its recording's local clock."""
     n = round(seconds * SAMPLE_RATE)
     common = microphone.start_s + microphone.clock_rate * np.arange(n) / SAMPLE_RATE

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from splashbench.files import write_png
 from splashbench.processes import end_with_parent
-from splashbench.synth.imaging.rendering import Stage, View
+from splashbench.synth.imaging.rendering import RoomView, TracedRoom
 from splashbench.synth.imaging.room import pour_room, static_room
 from splashbench.synth.liquid.surface import liquid_surface
 from splashbench.synth.liquid.trajectory import Trajectory
 from splashbench.synth.recording import plan as planned
 from splashbench.synth.recording.audio import SAMPLE_RATE, record, room_noise
-from splashbench.synth.recording.clip import board_images, board_poses
-from splashbench.synth.recording.plan import BOARD, CAMERAS, CHAPTERED, POUR_AT, Plan, Recorder
+from splashbench.synth.recording.board_clip import board_images, board_poses
+from splashbench.synth.recording.plan import BOARD, CAMERAS, CHAPTERED, POUR_AT, RecordingPlan, RigCamera
 from splashbench.synth.recording.video import SensorNoise, write_recording
 
 Frame = NDArray[np.uint8]
@@ -44,68 +44,68 @@ def prepare_worker() -> None:
 
 
 @lru_cache(maxsize=1)
-def _static_stage(seed: int) -> Stage:
-    return Stage(static_room(seed, BOARD))
+def _static_room(seed: int) -> TracedRoom:
+    return TracedRoom(static_room(seed, BOARD))
 
 
 @lru_cache(maxsize=1)
-def _pour_stage(seed: int) -> Stage:
-    return Stage(pour_room(seed))
+def _pour_room(seed: int) -> TracedRoom:
+    return TracedRoom(pour_room(seed))
 
 
-def _seed(plan: Plan, what: int, recorder: Recorder) -> tuple[int, ...]:
+def _seed(plan: RecordingPlan, what: int, recorder: RigCamera) -> tuple[int, ...]:
     return (plan.options.seed, what, CAMERAS.index(recorder.name))
 
 
-def intrinsics_clip(plan: Plan, name: str, session: Path) -> None:
+def intrinsics_clip(plan: RecordingPlan, name: str, session: Path) -> None:
     """Write the clip of the board moved in front of camera `name`."""
     recorder = plan.recorders[name]
     rng = np.random.default_rng(_seed(plan, 10, recorder))
     noise = SensorNoise(*plan.options.size, _seed(plan, 11, recorder))
     poses = board_poses(recorder.camera, BOARD, rng)
-    held = (
+    frames = (
         noise.expose(image)
         for image in board_images(recorder.camera, BOARD, poses, rng)
         for _ in range(planned.POSE_HOLD_FRAMES)
     )
     track = room_noise(len(poses) * planned.POSE_HOLD_FRAMES / plan.options.fps, _seed(plan, 12, recorder))
-    write_recording(session / INTRINSICS_FILE.format(name), held, plan.options.fps, track)
+    write_recording(session / INTRINSICS_FILE.format(name), frames, plan.options.fps, track)
 
 
-def static_clip(plan: Plan, name: str, session: Path) -> None:
+def static_clip(plan: RecordingPlan, name: str, session: Path) -> None:
     """Write camera `name`'s recording of the static scene."""
     recorder = plan.recorders[name]
     noise = SensorNoise(*plan.options.size, _seed(plan, 13, recorder))
-    image = View(_static_stage(plan.options.seed), recorder.camera).image
+    image = RoomView(_static_room(plan.options.seed), recorder.camera).image
     count = round(planned.STATIC_SECONDS * plan.options.fps)
     track = room_noise(count / plan.options.fps, _seed(plan, 14, recorder))
     path = session / STATIC_FILE.format(name)
     write_recording(path, (noise.expose(image) for _ in range(count)), plan.options.fps, track)
 
 
-def sweep_frames(plan: Plan, frames: range) -> list[Frame]:
+def sweep_frames(plan: RecordingPlan, frames: range) -> list[Frame]:
     """Some frames of the handheld sweep, noise included."""
-    made = []
+    images = []
     for frame in frames:
         noise = SensorNoise(*plan.options.size, (plan.options.seed, 15, frame))
-        view = View(_static_stage(plan.options.seed), plan.sweep[frame], samples=_SWEEP_SAMPLES)
-        made.append(noise.expose(view.image))
-    return made
+        view = RoomView(_static_room(plan.options.seed), plan.sweep[frame], samples=_SWEEP_SAMPLES)
+        images.append(noise.expose(view.image))
+    return images
 
 
-def write_sweep(plan: Plan, frames: list[Frame], session: Path) -> None:
+def write_sweep(plan: RecordingPlan, frames: list[Frame], session: Path) -> None:
     """Write the sweep from its frames."""
     track = room_noise(len(frames) / planned.SWEEP_FPS, (plan.options.seed, 16))
     write_recording(session / SWEEP_FILE, frames, planned.SWEEP_FPS, track)
 
 
-def pour_recording(plan: Plan, name: str, trajectory: Trajectory, session: Path) -> float:
+def pour_recording(plan: RecordingPlan, name: str, trajectory: Trajectory, session: Path) -> float:
     """Write camera `name`'s recording of the pour and its true masks.
 
     Returns the common time at which it first sees liquid, infinity if never.
     """
     recorder = plan.recorders[name]
-    view = View(_pour_stage(plan.options.seed), recorder.camera)
+    view = RoomView(_pour_room(plan.options.seed), recorder.camera)
     masks = session / "truth" / "masks" / name
     masks.mkdir(parents=True)
     write_png(session / "truth" / "container_masks" / f"{name}.png", _as_png(view.container_mask))
@@ -138,19 +138,19 @@ def pour_recording(plan: Plan, name: str, trajectory: Trajectory, session: Path)
     return first_seen[0]
 
 
-def _chapter_ends(recorder: Recorder) -> list[int]:
+def _chapter_ends(recorder: RigCamera) -> list[int]:
     """Frame numbers at which the recording's files end; the split falls into the middle of the pour."""
     if recorder.name != CHAPTERED:
         return [recorder.n_frames]
     return [round(0.6 * recorder.n_frames), recorder.n_frames]
 
 
-def pour_files(recorder: Recorder) -> list[str]:
+def pour_files(recorder: RigCamera) -> list[str]:
     """The recording's files, in order, relative to the session."""
     return [POUR_FILE.format(recorder.name, k + 1) for k in range(len(_chapter_ends(recorder)))]
 
 
-def _stamps(recorder: Recorder, frame: int) -> dict[str, str]:
+def _stamps(recorder: RigCamera, frame: int) -> dict[str, str]:
     """Creation time and timecode of a file, off by up to 20 ms as on synchronised action cameras."""
     rng = np.random.default_rng([*recorder.microphone.seed, 9])
     seconds = 10 * 3600 + recorder.common_time(frame) + float(rng.uniform(-0.02, 0.02))

@@ -1,4 +1,4 @@
-"""Everything about a made-up session that is decided before anything is drawn: lenses, poses, clocks, sounds, times.
+"""The plan of a synthetic session, decided before anything is drawn: lenses, poses, clocks, sounds, times.
 
 One seed decides it all. Common time is the local time of the reference camera; camera c's local clock reads
 (t - start_s[c]) / clock_rate[c].
@@ -15,9 +15,9 @@ from scipy.interpolate import CubicSpline
 
 from splashbench.errors import SplashbenchError
 from splashbench.synth.imaging.geometry import ARC_ORDER, LOOK_AT, arc_point, look_at
+from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.liquid.simulation import Pour
-from splashbench.synth.recording.audio import Microphone, Source, clap, pouring
-from splashbench.synth.recording.lens import LensCamera
+from splashbench.synth.recording.audio import Microphone, SoundSource, clap, pouring
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ _POUR_POSITION = np.array([0.0, 0.04, 0.0])
 
 
 @dataclass(frozen=True)
-class Options:
+class RecordingOptions:
     """What the user chooses. `duration` is the liquid's motion in seconds, `particle_radius` metres."""
 
     size: tuple[int, int] = (480, 270)
@@ -76,7 +76,7 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Recorder:
+class RigCamera:
     """One camera of the rig: its optics and place, its clock, and its microphone."""
 
     name: str
@@ -93,14 +93,14 @@ class Recorder:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """A whole session, ready to be made."""
+class RecordingPlan:
+    """A session as it will be made."""
 
-    options: Options
+    options: RecordingOptions
     pour: Pour
-    recorders: dict[str, Recorder]
+    recorders: dict[str, RigCamera]
     sweep: list[LensCamera]
-    sources: list[Source] = field(repr=False)
+    sources: list[SoundSource] = field(repr=False)
 
     @property
     def end(self) -> float:
@@ -108,7 +108,7 @@ class Plan:
         return POUR_AT + self.pour.duration
 
 
-def make_plan(options: Options) -> Plan:
+def make_plan(options: RecordingOptions) -> RecordingPlan:
     """Decide everything, from the seed."""
     rng = np.random.default_rng([options.seed, 0])
     pour = Pour(
@@ -129,13 +129,13 @@ def make_plan(options: Options) -> Plan:
             camera.center, start, 1 + drift, gain=float(rng.uniform(0.5, 1.5)), seed=(options.seed, 20 + k)
         )
         n_frames = int(np.ceil(seconds * options.fps))
-        recorders[name] = Recorder(name, camera, start, 1 + drift, options.fps, n_frames, microphone)
+        recorders[name] = RigCamera(name, camera, start, 1 + drift, options.fps, n_frames, microphone)
     sounds = np.random.default_rng([options.seed, 4])
     sources = [
         clap(sounds, CLAP_AT, _CLAP_POSITION),
         pouring(sounds, POUR_AT + 0.1, end + 0.1, _POUR_POSITION),
     ]
-    return Plan(options, pour, recorders, _sweep(rng, options.size), sources)
+    return RecordingPlan(options, pour, recorders, _sweep(rng, options.size), sources)
 
 
 def _lens(rng: np.random.Generator, size: tuple[int, int], degrees: float) -> tuple[Array, Array]:

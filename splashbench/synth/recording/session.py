@@ -1,4 +1,4 @@
-"""Make a session: what seven synchronised cameras and a handheld sweep would have recorded of a pour, with exact truth.
+"""A synthetic session: what seven cameras and a handheld sweep would have recorded of a pour, with exact truth.
 
 The folder has the layout `splashbench prepare` reads (docs: capture), and under truth/ what a real capture can never
 know.
@@ -27,14 +27,14 @@ from splashbench.synth.liquid import simulation
 from splashbench.synth.liquid.trajectory import Trajectory
 from splashbench.synth.recording import jobs
 from splashbench.synth.recording import plan as planned
-from splashbench.synth.recording.plan import BOARD, CAMERAS, Options, Plan, make_plan
+from splashbench.synth.recording.plan import BOARD, CAMERAS, RecordingOptions, RecordingPlan, make_plan
 from splashbench.synth.recording.truth import TruthCamera, TruthFile, TruthLens, TruthPour, TruthSound
 
 PARTICLE_HZ = 240  # cubic interpolation between the stored instants is then good to about 0.1 mm
 _SWEEP_CHUNK = 11
 
 
-def make_session(out: Path, options: Options, replace: bool = False, workers: int | None = None) -> Path:
+def make_session(out: Path, options: RecordingOptions, replace: bool = False, workers: int | None = None) -> Path:
     """Make a session in the new folder `out` with `workers` processes (default: one per core); returns `out`.
 
     Raises SplashbenchError when the liquid solver cannot run or `out` exists and `replace` is false.
@@ -83,27 +83,27 @@ def _gather(futures: list[Future[Any]], description: str) -> None:
         raise
 
 
-def _still_recordings(pool: ProcessPoolExecutor, plan: Plan, directory: Path) -> None:
+def _still_recordings(pool: ProcessPoolExecutor, plan: RecordingPlan, directory: Path) -> None:
     """Sweep, static scene and calibration clips: all that needs no liquid."""
     chunks = [
         range(start, min(start + _SWEEP_CHUNK, planned.SWEEP_FRAMES))
         for start in range(0, planned.SWEEP_FRAMES, _SWEEP_CHUNK)
     ]
     sweep = [pool.submit(jobs.sweep_frames, plan, chunk) for chunk in chunks]
-    makers: list[Callable[[Plan, str, Path], None]] = [jobs.static_clip, jobs.intrinsics_clip]
+    makers: list[Callable[[RecordingPlan, str, Path], None]] = [jobs.static_clip, jobs.intrinsics_clip]
     clips: list[Future[Any]] = [pool.submit(maker, plan, name, directory) for maker in makers for name in CAMERAS]
     _gather([*sweep, *clips], "static scene, sweep and boards")
     jobs.write_sweep(plan, [frame for chunk in sweep for frame in chunk.result()], directory)
 
 
-def _pour_recordings(pool: ProcessPoolExecutor, plan: Plan, trajectory: Trajectory, directory: Path) -> float:
+def _pour_recordings(pool: ProcessPoolExecutor, plan: RecordingPlan, trajectory: Trajectory, directory: Path) -> float:
     """All cameras' recordings of the pour; returns the common time at which liquid comes into view."""
-    made = [pool.submit(jobs.pour_recording, plan, name, trajectory, directory) for name in CAMERAS]
-    _gather(list(made), "pour recordings")
-    return min(future.result() for future in made)
+    recordings = [pool.submit(jobs.pour_recording, plan, name, trajectory, directory) for name in CAMERAS]
+    _gather(list(recordings), "pour recordings")
+    return min(future.result() for future in recordings)
 
 
-def _write_truth(plan: Plan, trajectory: Trajectory, first_seen: float, directory: Path) -> None:
+def _write_truth(plan: RecordingPlan, trajectory: Trajectory, first_seen: float, directory: Path) -> None:
     truth = directory / "truth"
     if not np.isfinite(first_seen):
         raise SplashbenchError("no camera saw any liquid; give a longer --duration")
@@ -144,7 +144,7 @@ def _lens(camera: Any) -> dict[str, Any]:
     }
 
 
-def _write_particles(path: Path, plan: Plan, trajectory: Trajectory) -> None:
+def _write_particles(path: Path, plan: RecordingPlan, trajectory: Trajectory) -> None:
     """Positions, velocities and existence on a uniform grid of common times from the first drop to the end."""
     steps = round(plan.pour.duration * PARTICLE_HZ)
     since_start = np.arange(steps + 1) / PARTICLE_HZ
@@ -172,7 +172,7 @@ def write_ply(path: Path, vertices: Any, faces: Any) -> None:
     path.write_text(head + "\n".join(body) + "\n", encoding="ascii")
 
 
-def _description(plan: Plan) -> dict[str, Any]:
+def _description(plan: RecordingPlan) -> dict[str, Any]:
     """The contents of session.toml."""
     return {
         "schema_version": 1,

@@ -1,4 +1,4 @@
-"""The ground truth of a made-up session: `truth/truth.json` (conventions in `TruthFile`) and what lies beside it."""
+"""The ground truth of a synthetic session: `truth/truth.json` (conventions in `TruthFile`) and what lies beside it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from splashbench.files import read_model, read_npz
-from splashbench.synth.recording.lens import LensCamera
+from splashbench.synth.imaging.lens import LensCamera
 
 Array = NDArray[np.float64]
 Matrix = list[list[float]]
 
 
-class _Strict(BaseModel):
+class _TruthTable(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class TruthLens(_Strict):
+class TruthLens(_TruthTable):
     """`K` in pixels with pixel centres at +0.5; `distortion` k1, k2, p1, p2, k3 (Brown-Conrady, OpenCV's order)."""
 
     width: int
@@ -41,7 +41,7 @@ class TruthCamera(TruthLens):
         return LensCamera(self.width, self.height, np.array(self.K), np.array(self.distortion), np.array(self.w2c))
 
 
-class TruthSound(_Strict):
+class TruthSound(_TruthTable):
     """When the clap sounds (common time, seconds), and where the sounds come from (world, metres)."""
 
     clap_time_s: float
@@ -49,14 +49,14 @@ class TruthSound(_Strict):
     pour_position: list[float]
 
 
-class TruthPour(_Strict):
+class TruthPour(_TruthTable):
     """The common time, in seconds, at which liquid comes into view, and at which the simulated motion ends."""
 
     start_s: float
     end_s: float
 
 
-class TruthFile(_Strict):
+class TruthFile(_TruthTable):
     """truth/truth.json. Common time is the local time of the camera `reference`."""
 
     schema_version: int

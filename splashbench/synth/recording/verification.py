@@ -1,25 +1,25 @@
-"""Judge a prepared scene by the truth of the made-up session it came from, and give it its true particles.
+"""Judge a prepared scene by the truth of the synthetic session it came from, and give it its true particles.
 
-Errors are stated as a user would ask for them: how far apart in time the cameras are believed to be, how wrong the
-lenses and poses are, how wrong the metre is, how well the masks fit. A reconstruction's frame is its own, so it is
-laid onto the world first: true points of the liquid are projected by the true cameras, triangulated by the estimated
-ones, and the similarity between the two clouds (Umeyama 1991) is the one used throughout. The camera centres alone
-would not do: on an arc they leave the turn about its chord open, by a third of a degree at millimetre errors.
+Errors are stated as a user would ask for them: of the clocks, the lenses, the poses, the metre and the masks. A
+reconstruction has a frame of its own, so it is aligned with the world first. True points of the liquid are projected by
+the true cameras and triangulated by the estimated ones; the similarity between the two clouds is used throughout. The
+camera centres alone would not do: on an arc they leave the turn about its chord open, by a third of a degree at
+millimetre errors.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from splashbench.alignment import Similarity, umeyama
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray, read_model
 from splashbench.scene import Particles, Scene
-from splashbench.synth.recording.lens import distort, undistort
+from splashbench.synth.imaging.lens import distort, undistort
 from splashbench.synth.recording.truth import Truth
 
 Array = NDArray[np.float64]
@@ -28,7 +28,7 @@ _SEEN_AS_EXACT = 7e-5
 
 
 class _FromReport(BaseModel):
-    """A part of prepare_report.json; what else it holds is none of our business."""
+    """A part of prepare_report.json; other keys are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -49,7 +49,7 @@ class _Pose(_FromReport):
     w2c: list[list[float]]
 
 
-class _Report(_FromReport):
+class _PrepareReport(_FromReport):
     reference: str
     sync: dict[str, _Sync]
     intrinsics: dict[str, _Intrinsics]
@@ -84,38 +84,6 @@ class Verification(BaseModel):
     particles_attached: int
 
 
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """world = scale * rotation @ scene + shift."""
-
-    scale: float
-    rotation: Array
-    shift: Array
-
-    def to_world(self, points: Array) -> Array:
-        """Scene points [..., 3] in the true world."""
-        return self.scale * points @ self.rotation.T + self.shift
-
-    def to_scene(self, points: Array) -> Array:
-        """World points [..., 3] in the scene's coordinates."""
-        return (points - self.shift) @ self.rotation / self.scale
-
-    def vectors_to_scene(self, vectors: Array) -> Array:
-        """World vectors [..., 3], such as velocities, in the scene's coordinates."""
-        return vectors @ self.rotation / self.scale
-
-
-def align(scene_points: Array, world_points: Array) -> Similarity:
-    """The similarity that maps points [N, 3] onto their counterparts with the least squared error (Umeyama 1991)."""
-    scene_mean, world_mean = scene_points.mean(axis=0), world_points.mean(axis=0)
-    a, b = scene_points - scene_mean, world_points - world_mean
-    u, singular, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(sign) @ vt
-    scale = float((singular * sign).sum() / (a**2).sum())
-    return Similarity(scale, rotation, world_mean - scale * rotation @ scene_mean)
-
-
 def verify_scene(session: Path, scene_directory: Path, attach: bool = True) -> Verification:
     """Compare the scene made from `session` with its truth; with `attach`, write the scene's truth/particles.npz.
 
@@ -124,27 +92,27 @@ def verify_scene(session: Path, scene_directory: Path, attach: bool = True) -> V
     truth = Truth(session)
     scene = Scene.open(scene_directory)
     report_path = Path(scene_directory) / "prepare_report.json"
-    report = read_model(report_path, _Report)
-    wanted = set(truth.file.cameras)
-    for what, found in (("sync", report.sync), ("intrinsics", report.intrinsics), ("poses", report.poses)):
-        if set(found) != wanted:
+    report = read_model(report_path, _PrepareReport)
+    names = set(truth.file.cameras)
+    for what, reported in (("sync", report.sync), ("intrinsics", report.intrinsics), ("poses", report.poses)):
+        if set(reported) != names:
             raise SplashbenchError(
-                f"{report_path}: {what} covers the cameras {sorted(found)}, the session {sorted(wanted)}; "
+                f"{report_path}: {what} covers the cameras {sorted(reported)}, the session {sorted(names)}; "
                 "give the scene that was prepared from this session"
             )
-    if report.reference not in wanted or set(scene.cameras) != wanted:
+    if report.reference not in names or set(scene.cameras) != names:
         raise SplashbenchError(f"{scene_directory} has other cameras than {session}; give the scene prepared from it")
     sync = {name: sync_error(truth, report, name) for name in scene.cameras}
     points = _liquid_points(truth)
-    similarity = align(triangulate(truth, report, points), points)
+    world_from_scene = umeyama(nearest_to_rays(truth, report, points), points)
     cameras = {
         name: CameraErrors(
             sync_error_ms=1e3 * sync[name],
             focal_error_percent=_focal_error(truth, report, name),
             mask_iou=mask_iou(truth, scene, report, name),
-            **_pose_errors(truth, report, similarity, name),
+            **_pose_errors(truth, report, world_from_scene, name),
         )
-        for name in sorted(wanted)
+        for name in sorted(names)
     }
     ious = [errors.mask_iou for errors in cameras.values() if errors.mask_iou is not None]
     metres = scene.metres_per_unit
@@ -157,9 +125,9 @@ def verify_scene(session: Path, scene_directory: Path, attach: bool = True) -> V
         focal_error_percent=_largest([errors.focal_error_percent for errors in cameras.values()]),
         rotation_error_deg=_largest([errors.rotation_error_deg for errors in cameras.values()]),
         position_error_mm=_largest([errors.position_error_mm for errors in cameras.values()]),
-        scale_error_percent=None if metres is None else 100 * (metres / similarity.scale - 1),
+        scale_error_percent=None if metres is None else 100 * (metres / world_from_scene.scale - 1),
         mask_iou=float(np.mean(ious)) if ious else None,
-        particles_attached=attach_particles(truth, scene, report.reference, similarity) if attach else 0,
+        particles_attached=attach_particles(truth, scene, report.reference, world_from_scene) if attach else 0,
     )
 
 
@@ -168,7 +136,7 @@ def _largest(values: list[float]) -> float:
     return max(values, key=abs)
 
 
-def sync_error(truth: Truth, report: _Report, name: str) -> float:
+def sync_error(truth: Truth, report: _PrepareReport, name: str) -> float:
     """Estimated minus true time on the reference's clock, in seconds, where it is worst during the pour."""
     camera, reference = truth.file.cameras[name], truth.file.cameras[report.reference]
     common = np.array([truth.file.pour.start_s, truth.file.pour.end_s])
@@ -178,7 +146,7 @@ def sync_error(truth: Truth, report: _Report, name: str) -> float:
     return _largest((estimated - true).tolist())
 
 
-def _focal_error(truth: Truth, report: _Report, name: str) -> float:
+def _focal_error(truth: Truth, report: _PrepareReport, name: str) -> float:
     estimated, true = np.array(report.intrinsics[name].K), np.array(truth.file.cameras[name].K)
     return float(100 * ((estimated[0, 0] + estimated[1, 1]) / (true[0, 0] + true[1, 1]) - 1))
 
@@ -188,16 +156,16 @@ def _centres(matrices: list[list[list[float]]] | list[Array]) -> Array:
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
-def _liquid_points(truth: Truth, instants: int = 5, most: int = 2000) -> Array:
+def _liquid_points(truth: Truth, instants: int = 5, max_points: int = 2000) -> Array:
     """True particles [N, 3], spread over the pour and over the particles there are."""
     pour = truth.file.pour
     times = pour.start_s + (pour.end_s - pour.start_s) * (np.arange(instants) + 1) / (instants + 1)
     positions, _, active = truth.particles_at(times)
     points = positions[active].astype(np.float64)
-    return points[:: max(1, len(points) // most)]
+    return points[:: max(1, len(points) // max_points)]
 
 
-def triangulate(truth: Truth, report: _Report, points: Array, rounds: int = 10) -> Array:
+def nearest_to_rays(truth: Truth, report: _PrepareReport, points: Array, rounds: int = 10) -> Array:
     """Where the estimated cameras see world points [N, 3], in the report's frame: nearest to all their rays.
 
     A camera far off the others counts for less (each round weighs it by the inverse square of its rays' miss), so that
@@ -210,15 +178,15 @@ def triangulate(truth: Truth, report: _Report, points: Array, rounds: int = 10) 
     for _ in range(rounds):
         across = np.einsum("c,cnij->nij", weights, off_ray)
         along = np.einsum("c,cnij,cj->ni", weights, off_ray, centres)
-        found = np.linalg.solve(across, along[..., None])[..., 0]
-        reach = found - centres[:, None]
+        nearest = np.linalg.solve(across, along[..., None])[..., 0]
+        reach = nearest - centres[:, None]
         miss = np.linalg.norm(np.einsum("cnij,cnj->cni", off_ray, reach), axis=2) / np.linalg.norm(reach, axis=2)
         weights = 1.0 / (np.mean(miss**2, axis=1) + _SEEN_AS_EXACT**2)
         weights /= weights.sum()
-    return np.asarray(found)
+    return np.asarray(nearest)
 
 
-def _off_ray(truth: Truth, report: _Report, name: str, points: Array) -> Array:
+def _off_ray(truth: Truth, report: _PrepareReport, name: str, points: Array) -> Array:
     """Projectors [N, 3, 3] onto the plane across the ray along which the estimated camera sees each world point."""
     camera, lens, pose = truth.file.cameras[name], report.intrinsics[name], np.array(report.poses[name].w2c)
     w2c, K = np.array(camera.w2c), np.array(camera.K)
@@ -231,15 +199,15 @@ def _off_ray(truth: Truth, report: _Report, name: str, points: Array) -> Array:
     return np.asarray(np.eye(3) - rays[:, :, None] * rays[:, None, :])
 
 
-def _pose_errors(truth: Truth, report: _Report, similarity: Similarity, name: str) -> dict[str, float]:
+def _pose_errors(truth: Truth, report: _PrepareReport, world_from_scene: Similarity, name: str) -> dict[str, float]:
     estimated, true = np.array(report.poses[name].w2c), np.array(truth.file.cameras[name].w2c)
-    turn = estimated[:3, :3] @ similarity.rotation.T @ true[:3, :3].T
+    turn = estimated[:3, :3] @ world_from_scene.rotation.T @ true[:3, :3].T
     angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
-    offset = similarity.to_world(_centres([estimated])) - _centres([true])
+    offset = world_from_scene.apply(_centres([estimated])) - _centres([true])
     return {"rotation_error_deg": float(angle), "position_error_mm": float(1e3 * np.linalg.norm(offset))}
 
 
-def mask_iou(truth: Truth, scene: Scene, report: _Report, name: str) -> float | None:
+def mask_iou(truth: Truth, scene: Scene, report: _PrepareReport, name: str) -> float | None:
     """Mean IoU of the scene's masks with the true ones, seen through the lens that `prepare` estimated.
 
     Frames in which neither has liquid count as 1. None for a scene without frames.
@@ -254,28 +222,30 @@ def mask_iou(truth: Truth, scene: Scene, report: _Report, name: str) -> float | 
     raw = distort(normalised, np.array(lens.distortion)) @ K[:2, :2].T + K[:2, 2]
     # OpenCV counts pixel centres at whole numbers.
     map_x, map_y = ((raw[..., k] - 0.5).astype(np.float32) for k in (0, 1))
-    found = []
+    ious = []
     for t, time in enumerate(scene.camera_times[name]):
         source = round((time - clock.start_s) / clock.clock_rate * recorder.fps)
         path = truth.mask_path(name, source)
         mask = scene.mask(name, t)
         if not path.is_file():
-            found.append(0.0 if mask.any() else 1.0)
+            ious.append(0.0 if mask.any() else 1.0)
             continue
         seen = cv2.remap(read_gray(path), map_x, map_y, cv2.INTER_LINEAR) > 127
         union = np.count_nonzero(seen | mask)
-        found.append(np.count_nonzero(seen & mask) / union if union else 1.0)
-    return float(np.mean(found)) if found else None
+        ious.append(np.count_nonzero(seen & mask) / union if union else 1.0)
+    return float(np.mean(ious)) if ious else None
 
 
-def attach_particles(truth: Truth, scene: Scene, reference: str, similarity: Similarity) -> int:
+def attach_particles(truth: Truth, scene: Scene, reference: str, world_from_scene: Similarity) -> int:
     """Write the true particles, at the scene's times and in its coordinates, to its truth/; returns their number."""
     clock = truth.file.cameras[reference]
     positions, velocities, active = truth.particles_at(clock.start_s + clock.clock_rate * scene.times)
     particles = Particles(
-        positions=(similarity.to_scene(positions.astype(np.float64)) * active[..., None]).astype(np.float32),
+        positions=(world_from_scene.invert(positions.astype(np.float64)) * active[..., None]).astype(np.float32),
         active=active,
-        velocities=(similarity.vectors_to_scene(velocities.astype(np.float64)) * active[..., None]).astype(np.float32),
+        velocities=(world_from_scene.invert_vectors(velocities.astype(np.float64)) * active[..., None]).astype(
+            np.float32
+        ),
     )
     particles.save(scene.directory / "truth" / "particles.npz")
     return int(active.any(axis=0).sum())

@@ -49,6 +49,7 @@ def write_recording(
     timecode: str = "10:00:00:00",
 ) -> None:
     """Write sRGB frames [H, W, 3] of even size at `fps`, with the 48 kHz `track` [n] on both audio channels."""
+    # PyAV, not imageio: that writes no timecode track, no sound from memory, and no timestamps of one's choice.
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from splashbench.prepare.calibration.checkerboard import (
 )
 from splashbench.prepare.calibration.intrinsics import calibrate, calibrate_views
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.session import Board
+from splashbench.prepare.session_tables import Board
 from splashbench.prepare.video.stills import Stills
 
 BOARD = Board(kind="checkerboard", squares_x=8, squares_y=5, square_metres=0.03)

@@ -12,7 +12,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardDetector, BoardView
 from splashbench.prepare.calibration.intrinsics import calibrate, calibrate_views, coverage, spread_out
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.session import Board
+from splashbench.prepare.session_tables import Board
 
 BOARD = Board(squares_x=8, squares_y=5, square_metres=0.03, marker_metres=0.0225, dictionary="DICT_4X4_50")
 WIDTH, HEIGHT = 480, 270

@@ -12,7 +12,7 @@ import pytest
 from splashbench.prepare.calibration.board import BoardDetector, BoardView
 from splashbench.prepare.calibration.intrinsics import Calibration, calibrate, calibrate_views
 from splashbench.prepare.calibration.lens import Lens
-from splashbench.prepare.session import Board
+from splashbench.prepare.session_tables import Board
 
 BOARD = Board(squares_x=8, squares_y=5, square_metres=0.06, marker_metres=0.045, dictionary="DICT_4X4_50")
 NOISE_PX = 0.15

@@ -14,8 +14,8 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.init.board_guess import guess_board
 from splashbench.prepare.init.description import describe
-from splashbench.prepare.init.discovery import Film, find_films
-from splashbench.prepare.init.inspection import Look, MarkerFinder, assign, look_at
+from splashbench.prepare.init.discovery import FoundRecording, find_recordings
+from splashbench.prepare.init.inspection import Inspection, MarkerFinder, assign, inspect_recording
 
 BOARD = cv2.aruco.CharucoBoard((8, 5), 0.03, 0.0225, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50))
 
@@ -66,16 +66,16 @@ def test_a_folder_per_camera_and_subject(tmp_path: Path) -> None:
         "truth/pour.mp4",
         ".trash/pour.mp4",
     )
-    assert find_films(tmp_path) == [
-        Film(("sweep/GX010001.MP4",), "", "sweep"),
-        Film(("cameras/2/static/GX010002.MP4",), "2", "static"),
-        Film(("cameras/10/intrinsics/GX010001.MP4",), "10", "intrinsics"),
-        Film(("cameras/10/pour/GX010003.MP4", "cameras/10/pour/GX020003.MP4"), "10", "pour"),
+    assert find_recordings(tmp_path) == [
+        FoundRecording(("sweep/GX010001.MP4",), "", "sweep"),
+        FoundRecording(("cameras/2/static/GX010002.MP4",), "2", "static"),
+        FoundRecording(("cameras/10/intrinsics/GX010001.MP4",), "10", "intrinsics"),
+        FoundRecording(("cameras/10/pour/GX010003.MP4", "cameras/10/pour/GX020003.MP4"), "10", "pour"),
     ]
 
 
 @pytest.mark.parametrize(
-    ("names", "camera", "filmed", "chapters"),
+    ("names", "camera", "subject", "chapters"),
     [
         (("cam1_GX010007.MP4", "cam1_GX020007.MP4"), "cam1", None, 2),
         (("left/DCIM/100GOPRO/GOPR0004.MP4", "left/DCIM/100GOPRO/GP010004.MP4"), "left", None, 2),
@@ -88,38 +88,40 @@ def test_a_folder_per_camera_and_subject(tmp_path: Path) -> None:
     ],
 )
 def test_ways_to_name_files(
-    tmp_path: Path, names: tuple[str, ...], camera: str, filmed: str | None, chapters: int
+    tmp_path: Path, names: tuple[str, ...], camera: str, subject: str | None, chapters: int
 ) -> None:
     touch(tmp_path, *names)
-    (film,) = find_films(tmp_path)
-    assert (film.camera, film.filmed, len(film.files)) == (camera, filmed, chapters)
-    assert film.files == names
+    (recording,) = find_recordings(tmp_path)
+    assert (recording.camera, recording.subject, len(recording.files)) == (camera, subject, chapters)
+    assert recording.files == names
 
 
-def test_no_film_is_one_line(tmp_path: Path) -> None:
+def test_no_video_is_one_line(tmp_path: Path) -> None:
     touch(tmp_path, "notes.txt")
-    with pytest.raises(SplashbenchError, match="no film in it"):
-        find_films(tmp_path)
+    with pytest.raises(SplashbenchError, match="no video in it"):
+        find_recordings(tmp_path)
 
 
-def film(name: str, filmed: str | None = None) -> Film:
-    return Film((name,), "1", filmed)
+def recording(name: str, subject: str | None = None) -> FoundRecording:
+    return FoundRecording((name,), "1", subject)
 
 
-def test_what_films_show_is_told_from_looks() -> None:
-    looks = {
-        ("a",): Look(seconds=20, marker_share=0.9, marker_travel=0.4, change=25, shift=0.01),
-        ("b",): Look(seconds=5, marker_share=1.0, marker_travel=0.0, change=0.5, shift=0.0),
-        ("c",): Look(seconds=60, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
-        ("d",): Look(seconds=30, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
+def test_subjects_are_told_from_inspections() -> None:
+    inspections = {
+        ("a",): Inspection(seconds=20, marker_share=0.9, marker_travel=0.4, change=25, shift=0.01),
+        ("b",): Inspection(seconds=5, marker_share=1.0, marker_travel=0.0, change=0.5, shift=0.0),
+        ("c",): Inspection(seconds=60, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
+        ("d",): Inspection(seconds=30, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
     }
-    shown = {f.files[0]: f.filmed for f in assign([film(name) for name in "dcba"], looks)}
+    shown = {f.files[0]: f.subject for f in assign([recording(name) for name in "dcba"], inspections)}
     assert shown == {"a": "intrinsics", "b": "static", "c": "pour", "d": None}
-    # Names outweigh looks.
-    shown = {f.files[0]: f.filmed for f in assign([film("c", "static"), film("d"), film("a")], looks)}
+    # Names outweigh inspections.
+    shown = {
+        f.files[0]: f.subject for f in assign([recording("c", "static"), recording("d"), recording("a")], inspections)
+    }
     assert shown == {"c": "static", "d": "pour", "a": "intrinsics"}
-    moving = {("s",): Look(seconds=40, marker_share=0.4, marker_travel=0.5, change=30, shift=0.1)}
-    assert assign([film("s")], moving)[0].filmed == "sweep"
+    moving = {("s",): Inspection(seconds=40, marker_share=0.4, marker_travel=0.5, change=30, shift=0.1)}
+    assert assign([recording("s")], moving)[0].subject == "sweep"
 
 
 def test_looks_tell_rest_board_and_travel(tmp_path: Path) -> None:
@@ -128,7 +130,9 @@ def test_looks_tell_rest_board_and_travel(tmp_path: Path) -> None:
     wide = scenery(960, 180)
     write_clip(tmp_path / "sweep.mp4", [np.ascontiguousarray(wide[:, 20 * k : 20 * k + 320]) for k in range(12)])
     write_clip(tmp_path / "board.mp4", [with_board(0.3, 12.0 * k) for k in range(12)])
-    rest, travel, board = (look_at([tmp_path / f"{name}.mp4"], MarkerFinder()) for name in ("still", "sweep", "board"))
+    rest, travel, board = (
+        inspect_recording([tmp_path / f"{name}.mp4"], MarkerFinder()) for name in ("still", "sweep", "board")
+    )
     assert (rest.marker_share, rest.change < 2, rest.shift < 0.005) == (0, True, True)
     assert travel.shift > 0.03
     assert board.marker_share == 1
@@ -169,7 +173,7 @@ def test_a_session_is_described(folder: Path, capsys: pytest.CaptureFixture[str]
     assert described["board"]["marker_metres"] == pytest.approx(0.0225, rel=0.06)
     assert described["recordings"]["pour"]["cam2"] == ["cam2/GX010003.MP4"]
     assert "no handheld sweep" in capsys.readouterr().err
-    # It is a session: what prepare finds wanting is in the films, not in their description.
+    # It is a session: what prepare finds wanting is in the recordings, not in their description.
     assert main(["prepare", str(folder), str(folder.parent / "scene")]) == 1
     assert "has no audio track" in capsys.readouterr().err
     assert main(["prepare", str(folder), "--init"]) == 1

@@ -13,7 +13,7 @@ from splashbench.files import write_png
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.undistort import Undistorter
 from splashbench.prepare.container import container_masks
-from splashbench.prepare.crop import Box
+from splashbench.prepare.crop import PixelBox
 from splashbench.prepare.masks.background import Background, BackgroundMasks, segment
 from splashbench.prepare.masks.provider import FolderMasks, mask_health
 
@@ -149,7 +149,7 @@ def test_undistorted_mask_has_its_outline_in_the_right_place() -> None:
 def test_pincushion_corners_have_no_source_and_no_mask() -> None:
     undistorter = Undistorter(lens(0.3))
     assert undistorter.source_share() < 0.99
-    assert undistorter.source_share(Box(90, 60, 150, 100)) == 1.0
+    assert undistorter.source_share(PixelBox(90, 60, 150, 100)) == 1.0
     mask = undistorter.mask(np.ones((HEIGHT, WIDTH), bool))
     image = undistorter.image(np.full((HEIGHT, WIDTH, 3), 200, np.uint8))
     assert not mask[0, 0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import shutil
 import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,126 +12,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.masks import sam3_checkpoint
 from splashbench.prepare.masks.sam3 import Sam3Masks
 from splashbench.prepare.masks.sam3_checkpoint import Sam3Checkpoint
-from splashbench.prepare.session import Click, Masks
+from splashbench.prepare.session_tables import MaskClick
 
 # transformers for Python 3.10 compiles in the old way.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 WIDTH, HEIGHT = 90, 60
-SIZE, PATCH = 56, 14
-GRID = SIZE // PATCH
-# Channels: the library has 64 for its memory written into it, and needs more than these elsewhere.
-WIDE = 128
+SIZE = 56  # of the checkpoint's images, see conftest
 needs_transformers = pytest.mark.skipif(
     importlib.util.find_spec("transformers") is None, reason="needs transformers: pip install 'splashbench[sam3]'"
 )
-
-
-def tiny_config() -> dict[str, Any]:
-    """The published checkpoint's shape with the smallest numbers that work."""
-    small = {"hidden_size": 16, "num_attention_heads": 2, "intermediate_size": 32}
-    wide = small | {"hidden_size": WIDE}
-    backbone = small | {
-        "model_type": "sam3_vit_model",
-        "num_hidden_layers": 2,
-        "image_size": SIZE,
-        "patch_size": PATCH,
-        "window_size": 2,
-        "global_attn_indexes": [1],
-        "pretrain_image_size": 28,
-    }
-    vision = {
-        "model_type": "sam3_vision_model",
-        "backbone_config": backbone,
-        "fpn_hidden_size": WIDE,
-        "backbone_feature_sizes": [[4 * GRID] * 2, [2 * GRID] * 2, [GRID] * 2],
-    }
-    text = small | {
-        "model_type": "clip_text_model",
-        "vocab_size": 600,
-        "projection_dim": 8,
-        "num_hidden_layers": 1,
-        "max_position_embeddings": 32,
-        "bos_token_id": 512,
-        "eos_token_id": 513,
-        "pad_token_id": 513,
-    }
-    detector = {
-        "vision_config": vision,
-        "text_config": text,
-        "geometry_encoder_config": wide | {"num_layers": 1},
-        "detr_encoder_config": wide | {"num_layers": 1},
-        "detr_decoder_config": wide | {"num_layers": 1, "num_queries": 6},
-        "mask_decoder_config": {"hidden_size": WIDE, "num_attention_heads": 2},
-    }
-    tracker = {
-        "vision_config": vision,
-        "prompt_encoder_config": {"hidden_size": WIDE, "image_size": SIZE, "mask_input_channels": 4},
-        "mask_decoder_config": {
-            "hidden_size": WIDE,
-            "mlp_dim": 32,
-            "num_attention_heads": 2,
-            "iou_head_hidden_dim": 16,
-        },
-        "memory_attention_hidden_size": WIDE,
-        "memory_attention_num_layers": 1,
-        "memory_attention_feed_forward_hidden_size": 32,
-        "memory_encoder_hidden_size": WIDE,
-        "memory_encoder_output_channels": 64,
-        "memory_attention_rope_feat_sizes": [GRID, GRID],
-        "mask_downsampler_embed_dim": WIDE,
-        "memory_fuser_embed_dim": WIDE,
-        "memory_fuser_intermediate_dim": 16,
-        "memory_fuser_num_layers": 1,
-        "image_size": SIZE,
-        "num_maskmem": 3,
-        "max_object_pointers_in_encoder": 4,
-    }
-    return {"detector_config": detector, "tracker_config": tracker, "low_res_mask_size": 4 * GRID}
-
-
-def write_tokenizer(folder: Path) -> None:
-    """CLIP's tokenizer over single bytes: 256 symbols, each also at the end of a word, a few merges."""
-    symbols = [chr(c) for c in [*range(33, 127), *range(161, 173), *range(174, 256), *range(256, 324)]]
-    assert len(symbols) == 256
-    words = [*symbols, *(f"{s}</w>" for s in symbols), "<|startoftext|>", "<|endoftext|>", "re", "wa"]
-    (folder / "vocab.json").write_text(json.dumps({word: n for n, word in enumerate(words)}))
-    (folder / "merges.txt").write_text("#version: 0.2\nr e\nw a\n")
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder like that of the published checkpoint, with random weights."""
-    pytest.importorskip("transformers", reason="needs transformers: pip install 'splashbench[sam3]'")
-    import torch
-    from transformers import Sam3VideoConfig
-    from transformers.models.sam3_video.modeling_sam3_video import Sam3VideoModel
-
-    folder = tmp_path_factory.mktemp("sam3")
-    with torch.random.fork_rng(), sam3_checkpoint._quiet():
-        torch.manual_seed(5)
-        model = Sam3VideoModel(Sam3VideoConfig(**tiny_config()))
-        # As they are drawn they are so small that no input makes a difference to the output.
-        for parameter in model.parameters():
-            if parameter.ndim > 1:
-                parameter.data.normal_(0.0, parameter[0].numel() ** -0.5)
-        model.save_pretrained(folder)
-    write_tokenizer(folder)
-    settings = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "size": {"height": SIZE, "width": SIZE}}
-    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
-    return folder
-
-
-@pytest.fixture
-def copied(checkpoint: Path, tmp_path: Path) -> Path:
-    """A copy of the checkpoint that the test may damage."""
-    return Path(shutil.copytree(checkpoint, tmp_path / "checkpoint"))
 
 
 @pytest.fixture(autouse=True)
@@ -218,7 +111,7 @@ def test_words_give_the_union_of_confident_instances_in_raw_geometry(checkpoint:
 def test_masks_are_the_same_each_time_and_leave_the_random_numbers_alone(checkpoint: Path) -> None:
     import torch
 
-    clicks = {"1": [Click(frame=4, x=45, y=15)]}
+    clicks = {"1": [MaskClick(frame=4, x=45, y=15)]}
     torch.manual_seed(5)
     first = list(provider(checkpoint, points=clicks, confidence=0.36).masks("1", [2, 4, 6]))
     drawn = torch.rand(3)
@@ -242,9 +135,9 @@ def test_clicks_are_followed_as_the_library_follows_them(checkpoint: Path) -> No
 
     indices = list(range(0, 54, 3))  # 18 frames, and the memory reaches 4
     clicks = [
-        Click(frame=30, x=45, y=40),
-        Click(frame=30, x=5, y=5, liquid=False),
-        Click(frame=36, x=50.5, y=30.25),
+        MaskClick(frame=30, x=45, y=40),
+        MaskClick(frame=30, x=5, y=5, liquid=False),
+        MaskClick(frame=36, x=50.5, y=30.25),
     ]
     recorded = Recorded()
     masks = Sam3Masks(recorded, checkpoint, SOURCES, text="", points={"1": clicks}, device="cpu")
@@ -278,7 +171,7 @@ def test_clicks_are_followed_as_the_library_follows_them(checkpoint: Path) -> No
 
 @needs_transformers
 def test_clicks_may_be_on_frames_that_are_not_asked_for(checkpoint: Path) -> None:
-    clicks = {"1": [Click(frame=15, x=45, y=35)]}
+    clicks = {"1": [MaskClick(frame=15, x=45, y=35)]}
     found = dict(provider(checkpoint, text="", points=clicks).masks("1", [2, 9, 21]))
     assert list(found) == [2, 9, 21]
     words = dict(provider(checkpoint, confidence=0.36).masks("1", [2, 9, 21]))
@@ -371,7 +264,7 @@ def test_what_a_checkpoint_cannot_do_is_said_before_it_is_loaded(copied: Path) -
         config = json.loads((copied / "config.json").read_text())
         (copied / "config.json").write_text(json.dumps(config | {"model_type": kind}))
 
-    clicks = {"1": [Click(frame=1, x=1, y=1)]}
+    clicks = {"1": [MaskClick(frame=1, x=1, y=1)]}
     retype("sam3")
     with pytest.raises(SplashbenchError, match="detector alone"):
         provider(copied, points=clicks)
@@ -391,7 +284,7 @@ def test_what_a_checkpoint_cannot_do_is_said_before_it_is_loaded(copied: Path) -
 
 @needs_transformers
 def test_prompts_that_make_no_sense_are_one_line(checkpoint: Path) -> None:
-    outside = provider(checkpoint, text="", points={"1": [Click(frame=1, x=WIDTH + 1, y=1)]})
+    outside = provider(checkpoint, text="", points={"1": [MaskClick(frame=1, x=WIDTH + 1, y=1)]})
     with pytest.raises(
         SplashbenchError, match=r"GX010001\.MP4: the click at \(91, 1\) lies outside its frames of 90x60"
     ):
@@ -399,7 +292,7 @@ def test_prompts_that_make_no_sense_are_one_line(checkpoint: Path) -> None:
     with pytest.raises(SplashbenchError, match="camera 1 has neither"):
         provider(checkpoint, text=" ")
     with pytest.raises(SplashbenchError, match="names camera 7"):
-        provider(checkpoint, points={"7": [Click(frame=1, x=1, y=1)]})
+        provider(checkpoint, points={"7": [MaskClick(frame=1, x=1, y=1)]})
     with pytest.raises(SplashbenchError, match="reads 32 tokens"):
         list(provider(checkpoint, text="liquid " * 25).masks("1", [1]))
 
@@ -409,39 +302,3 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monke
     with pytest.raises(SplashbenchError, match=r"pip install 'splashbench\[sam3\]'") as caught:
         provider(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_session_toml_describes_the_prompts() -> None:
-    masks = Masks.model_validate(
-        {
-            "provider": "sam3",
-            "checkpoint": "../models/sam3",
-            "text": "red water",
-            "points": {"3": [{"frame": 812, "x": 1204, "y": 733}, {"frame": 812, "x": 1, "y": 2, "liquid": False}]},
-        }
-    )
-    assert [click.liquid for click in masks.points["3"]] == [True, False]
-    assert Masks.model_validate({"provider": "sam3", "checkpoint": "x"}).text == "liquid"
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ({"provider": "sam3"}, 'checkpoint must be given with provider = "sam3"'),
-        ({"checkpoint": "x"}, 'checkpoint must be given with provider = "sam3"'),
-        ({"provider": "folder", "folder": "m", "text": "water"}, "text is for provider"),
-        ({"points": {"1": [{"frame": 1, "x": 1, "y": 1}]}}, "points is for provider"),
-        ({"provider": "sam3", "checkpoint": "x", "folder": "m"}, "folder must be given with"),
-        ({"provider": "sam3", "checkpoint": "x", "text": " "}, "say what to look for"),
-        ({"provider": "sam3", "checkpoint": "x", "points": {"1": []}}, "points.1"),
-        (
-            {"provider": "sam3", "checkpoint": "x", "points": {"1": [{"frame": 4, "x": 1, "y": 1, "liquid": False}]}},
-            "no click on liquid in frame 4",
-        ),
-        ({"provider": "sam3", "checkpoint": "x", "points": {"1": [{"frame": -1, "x": 1, "y": 1}]}}, "frame"),
-        ({"provider": "sam3", "checkpoint": "x", "confidence": 1.0}, "confidence"),
-    ],
-)
-def test_prompts_go_with_their_provider(data: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
-        Masks.model_validate(data)

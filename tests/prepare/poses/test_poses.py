@@ -11,29 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
+from splashbench.alignment import Similarity, umeyama
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardDetector, BoardView
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.poses import mapping, rig
 from splashbench.prepare.poses import structure_from_motion as poses_module
-from splashbench.prepare.poses.metric import (
-    Sighting,
-    Similarity,
-    align,
-    initial_points,
-    transformed,
-    triangulate,
-    umeyama,
-)
+from splashbench.prepare.poses.metric import Sighting, align, initial_points, transformed
 from splashbench.prepare.poses.rig import find_poses, sight_prints
-from splashbench.prepare.poses.structure_from_motion import (
-    Poses,
-    estimate_poses,
-    sharpest_per_bin,
-    sharpness_of,
-    static_image,
-)
-from splashbench.prepare.session import Board
+from splashbench.prepare.poses.structure_from_motion import Poses, estimate_poses
+from splashbench.prepare.session_tables import Board
 
 WIDTH, HEIGHT = 400, 225
 BOARD = Board(squares_x=8, squares_y=5, square_metres=0.05, marker_metres=0.0375, dictionary="DICT_4X4_50")
@@ -384,46 +371,3 @@ def test_one_misread_corner_does_not_bend_the_frame(capture: Capture, solved: Po
     spoiled = align(sightings, BoardDetector(BOARD))
     assert spoiled.n_corners == 27
     assert abs(spoiled.scene_from_sfm.scale / clean.scene_from_sfm.scale - 1) < 0.001
-
-
-def test_umeyama_recovers_a_similarity_also_from_a_plane() -> None:
-    rng = np.random.default_rng(1)
-    truth = Similarity(0.37, cv2.Rodrigues(np.array([0.3, -1.2, 2.0]))[0], np.array([1.0, -2.0, 0.5]))
-    for flatten in (1.0, 0.0):
-        source = rng.normal(size=(20, 3)) * [1.0, 1.0, flatten]
-        found = umeyama(source, truth.apply(source))
-        assert found.scale == pytest.approx(0.37, abs=1e-12)
-        np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-12)
-        np.testing.assert_allclose(found.translation, truth.translation, atol=1e-12)
-
-
-def test_a_mapped_camera_sees_the_mapped_point_in_the_same_pixel() -> None:
-    similarity = Similarity(2.5, cv2.Rodrigues(np.array([0.1, 0.7, -0.4]))[0], np.array([0.3, 0.1, -0.2]))
-    w2c = look(20, 30, 1.3)
-    point = np.array([[0.1, 0.2, -0.1]])
-    local = point @ w2c[:3, :3].T + w2c[:3, 3]
-    mapped = similarity.apply_w2c(w2c)
-    mapped_local = similarity.apply(point) @ mapped[:3, :3].T + mapped[:3, 3]
-    np.testing.assert_allclose(mapped_local, 2.5 * local, atol=1e-12)
-
-
-def test_triangulation_of_exact_rays_is_exact() -> None:
-    point = np.array([0.05, 0.11, -0.2])
-    poses = np.array([look(a, 25, 1.0) for a in (-30, 0, 25)])
-    local = point @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, :3, 3]
-    np.testing.assert_allclose(triangulate(local[:, :2] / local[:, 2:], poses), point, atol=1e-10)
-
-
-def test_the_sharpest_frame_of_each_bin_is_taken() -> None:
-    assert sharpest_per_bin([1, 5, 2, 9, 3, 3, 7, 0], 4) == [1, 3, 4, 6]
-    assert sharpest_per_bin([1.0, 2.0], 25) == [0, 1]
-    rng = np.random.default_rng(2)
-    sharp = rng.integers(0, 255, (60, 80)).astype(np.uint8)
-    assert sharpness_of(sharp) > 2 * sharpness_of(cv2.GaussianBlur(sharp, (0, 0), 1.0))
-
-
-def test_median_of_a_static_clip_has_less_noise() -> None:
-    rng = np.random.default_rng(3)
-    scene = rng.uniform(30, 220, (40, 60, 3))
-    frames = [np.clip(scene + rng.normal(0, 4, scene.shape), 0, 255).astype(np.uint8) for _ in range(15)]
-    assert np.std(static_image(frames) - scene) < 0.5 * np.std(frames[0] - scene)

@@ -10,15 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
+from splashbench.alignment import Similarity
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardDetector, BoardView
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.marker import MarkerDetector
 from splashbench.prepare.poses import rig
-from splashbench.prepare.poses.metric import MetricFrame, Print, Sighting, Similarity, agreeing, align_print
+from splashbench.prepare.poses.metric import MetricFrame, Print, Sighting, agreeing, align_print
 from splashbench.prepare.poses.scale import SceneFrame, Upright, choose_frame, distance_scale, rescaled, scene_frame
 from splashbench.prepare.poses.structure_from_motion import Poses
-from splashbench.prepare.session import Board, Distance, Marker
+from splashbench.prepare.session_tables import Board, Distance, Marker
 
 WIDTH, HEIGHT = 1200, 800
 SIDE = 0.12

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.texture import BOARD_PIXELS_PER_SQUARE, board_albedo, mottled, to_srgb
-from splashbench.synth.recording.lens import LensCamera
 
 Array = NDArray[np.float64]
 

@@ -69,7 +69,7 @@ def distort(normalised: Array, coefficients: Array) -> Array:
 
 
 def undistort(distorted: Array, coefficients: Array, iterations: int = 12) -> Array:
-    """Inverse of `distort` by fixed-point iteration, which converges fast for the mild lenses made up here."""
+    """Inverse of `distort` by fixed-point iteration, which converges fast for the mild lenses here."""
     guess = distorted
     for _ in range(iterations):
         guess = guess + (distorted - distort(guess, coefficients))

@@ -1,8 +1,8 @@
-"""The scanned container put into a scene that does not say where it stands, as the released ones.
+"""Placing a scanned container in a finished scene that does not say where it stands, such as the released ones.
 
-The release has container masks beside its whole images and meshes beside its scenes. The masks of the training views
-place the mesh; held-out ones verify. A container stands upright, so that its place also tells where gravity pulls; and
-as its mesh is in metres, the metric scale. All three go into scene.json (docs/scene_format.md).
+The release has container masks beside its whole images, and meshes beside its scenes. The masks of the training views
+place the mesh; held-out ones verify. A container stands upright, so its place also tells where gravity pulls. Its mesh
+is in metres, so its size tells the metric scale. All three go into scene.json (docs/scene_format.md).
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from splashbench.container.entry import LEAST_OVERLAP, known_of, masks_of, require_place, write_entry
-from splashbench.container.placement import Axis, Placement, place_by_silhouettes, up_from_container
+from splashbench.container.entry import LEAST_OVERLAP, masks_of, name_in_scene, require_place, stated_of, write_entry
+from splashbench.container.placement import Placement, place_by_silhouettes, up_from_container
+from splashbench.container.stance import Axis
 from splashbench.container.verification import Projection, verify
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.container import name_in_scene
 from splashbench.scene import Scene
 from splashbench.scene.container import FORMATS, ContainerMesh
 from splashbench.scene.layout import SceneMeta
 
 
 @dataclass(frozen=True)
-class ReleasedPlacement:
+class ScenePlacement:
     """Where the container stands in a scene.
 
     Attributes:
@@ -43,7 +43,7 @@ class ReleasedPlacement:
 
 def place_in_scene(
     scene: Scene, mesh: ContainerMesh, masked: Scene | None = None, up: Axis | None = None, metres_per_unit: float = 1.0
-) -> ReleasedPlacement:
+) -> ScenePlacement:
     """Where `mesh` stands in `scene`, by its container masks, or by those of `masked`.
 
     masked: the scene before it was cropped, of the same cameras. up: the mesh's direction that points up, exactly; None
@@ -72,7 +72,7 @@ def place_in_scene(
             f" views), less than {LEAST_OVERLAP}; check that it is this container's, and say what of it is up (--up)"
         )
     x, y, z = up_from_container(placement)
-    return ReleasedPlacement(placement, projections, (-x, -y, -z), metres_per_unit / placement.scale)
+    return ScenePlacement(placement, projections, (-x, -y, -z), metres_per_unit / placement.scale)
 
 
 def require_container_place(scene: Scene, mesh_file: Path, replace: bool) -> None:
@@ -91,17 +91,17 @@ def require_container_place(scene: Scene, mesh_file: Path, replace: bool) -> Non
 
 
 def write_placement(
-    scene: Scene, mesh_file: Path, found: ReleasedPlacement, transparent: bool | None = None, replace: bool = False
+    scene: Scene, mesh_file: Path, placed: ScenePlacement, transparent: bool | None = None, replace: bool = False
 ) -> SceneMeta:
-    """Copy the mesh into the scene's folder and say in scene.json where it stands; returns what stands there.
+    """Copy the mesh into the scene's folder and state in scene.json where it stands; returns the new scene.json.
 
-    Other fields there stay. Gravity and scale that it stated stay, too, unless `replace`.
+    Its other fields stay, gravity and scale among them unless `replace`.
     """
     require_container_place(scene, mesh_file, replace)
-    known = known_of(scene)
-    said: dict[str, Any] = {}
-    said |= {} if known.gravity and not replace else {"gravity": found.gravity}
-    said |= {} if known.metres_per_unit and not replace else {"metres_per_unit": found.metres_per_unit}
-    said |= {} if transparent is None else {"container_transparent": transparent}
+    stated = stated_of(scene)
+    facts: dict[str, Any] = {}
+    facts |= {} if stated.gravity and not replace else {"gravity": placed.gravity}
+    facts |= {} if stated.metres_per_unit and not replace else {"metres_per_unit": placed.metres_per_unit}
+    facts |= {} if transparent is None else {"container_transparent": transparent}
     name = name_in_scene(mesh_file)
-    return write_entry(scene, name, lambda path: shutil.copyfile(mesh_file, path), found.placement.pose, said)
+    return write_entry(scene, name, lambda path: shutil.copyfile(mesh_file, path), placed.placement.pose, facts)

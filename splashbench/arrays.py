@@ -1,7 +1,7 @@
-"""Array types for the results of `prepare`'s stages: numpy arrays to the type checker, and readable back from disk.
+"""Array types of stored results: numpy arrays to the type checker, and readable back from JSON.
 
-`stages` stores results as JSON and reads them by their annotations; an array annotated with one of these comes back
-with its values, shape and kind as they were.
+The stages of `prepare` store their results as JSON and read them by their annotations. An array annotated with one of
+these types comes back with its values, shape and kind as they were.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pydantic import PlainValidator
 
 
 def _stored(kind: DTypeLike) -> PlainValidator:
-    """Reads what `plain` made of an array."""
+    """The validator that reads what `plain` made of an array."""
 
     def read(value: Any) -> NDArray[Any]:
         if isinstance(value, np.ndarray):

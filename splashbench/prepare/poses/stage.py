@@ -1,0 +1,65 @@
+"""The stages poses and metric: structure from motion of the static scene, then its metres and its up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from splashbench.errors import SplashbenchError
+from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.poses import rig
+from splashbench.prepare.poses.rig import PosedRig, RigRecordings
+from splashbench.prepare.poses.scale import SceneFrame, Upright
+from splashbench.prepare.stage_cache import FileFacts, StageStore, facts_of
+
+
+def posed_rig(store: StageStore, recordings: RigRecordings, lenses: Mapping[str, Lens]) -> PosedRig:
+    """The cameras' poses in structure from motion's own units, and the prints that they see."""
+    session = recordings.session
+    inputs = {
+        "static": {camera: facts_of(static.paths) for camera, static in recordings.static.items()},
+        "sweep": facts_of(recordings.sweep.paths) if recordings.sweep else None,
+        "lenses": lenses,
+        "board": session.board,
+        "marker": session.marker,
+    }
+
+    def pose() -> PosedRig:
+        try:
+            with store.scratch() as scratch:
+                return recordings.pose(lenses, scratch)
+        except RuntimeError as error:  # COLMAP's, for one when its database finds the disk full
+            raise SplashbenchError(
+                f"{session.directory}: COLMAP failed ({error}); check the space in {store.folder}"
+            ) from None
+
+    return store.result("poses", PosedRig, inputs, pose)
+
+
+def metric_frame(
+    store: StageStore,
+    recordings: RigRecordings,
+    posed: PosedRig,
+    container_files: list[FileFacts],
+    place_container: Callable[[], Upright | None],
+) -> SceneFrame:
+    """The scene's frame in metres.
+
+    place_container: says which way is up from the container, in structure from motion's frame; None where the session
+        has none. It is called only where neither board nor marker gives the scene its up.
+    """
+    session, detector = recordings.session, recordings.detector
+    inputs = {
+        "posed": posed,
+        "board": session.board,
+        "marker": session.marker,
+        "distance": session.distance,
+        "container": session.container,
+        "container_files": container_files,
+        "train": session.train,
+    }
+
+    def find() -> SceneFrame:
+        container = None if rig.prints_are_seen(posed, session, detector) else place_container()
+        return rig.find_frame(posed, session, detector, container)
+
+    return store.result("metric", SceneFrame, inputs, find)

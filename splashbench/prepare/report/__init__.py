@@ -1,0 +1,1 @@
+"""prepare_report.html, the page that tells how a preparation went."""

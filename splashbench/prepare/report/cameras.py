@@ -1,0 +1,119 @@
+"""Cameras and lenses in the report: where the rig stands, how sure its poses are, how well each lens fits."""
+
+from __future__ import annotations
+
+import html
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
+from splashbench.prepare.preparation import Preparation
+from splashbench.prepare.report.html import SWEEP_COLOUR, TEST_COLOUR, TRAIN_COLOUR, bullets, figure_html, table
+
+
+def cameras_section(preparation: Preparation) -> list[str]:
+    """The rig from above and from the front with every camera's viewing direction, and a table of the poses."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4.4), layout="constrained")
+    centres = {camera: camera_centre(w2c) for camera, w2c in preparation.poses.w2c.items()}
+    sweep = np.array([camera_centre(w2c) for w2c in preparation.poses.sweep_w2c]).reshape(-1, 3)
+    reach = 1.25 * max(float(np.abs(centre).max()) for centre in centres.values())
+    points = preparation.poses.points[np.abs(preparation.poses.points).max(axis=1) < reach]
+    prints = preparation.metric.prints
+    for index, (title, a, b, label_b) in enumerate((("from above", 0, 2, "z"), ("from the front", 0, 1, "y"))):
+        axes = figure.add_subplot(1, 2, index + 1)
+        axes.scatter(points[:, a], points[:, b], s=0.3, color="#cccccc")
+        for name, print_ in prints.items():
+            axes.scatter(print_.corners[:, a], print_.corners[:, b], s=3, color="black", label=name)
+        axes.plot(sweep[:, a], sweep[:, b], ".", color=SWEEP_COLOUR, markersize=4, label="sweep")
+        for camera, centre in centres.items():
+            colour = TEST_COLOUR if camera in preparation.session.test else TRAIN_COLOUR
+            forward = preparation.poses.w2c[camera][2, :3] * 0.2 * reach
+            axes.plot(*([centre[k], centre[k] + forward[k]] for k in (a, b)), color=colour, linewidth=1)
+            axes.plot(centre[a], centre[b], "o", color=colour, markersize=5)
+            axes.annotate(camera, (centre[a], centre[b]), textcoords="offset points", xytext=(5, 5), fontsize=9)
+        axes.set(title=title, xlabel="x [m]", ylabel=f"{label_b} [m]", aspect="equal")
+        if label_b == "z":
+            axes.invert_yaxis()  # the cameras at the bottom, as if standing among them
+            axes.legend(fontsize=8)
+    poses = preparation.poses
+    width = next(iter(preparation.calibrations.values())).lens.width
+    text = (
+        f"Mean reprojection error {poses.mean_error_px:.3f} px (RMS {poses.rms_error_px:.3f}) over"
+        f" {poses.n_observations} observations of {len(poses.points)} points, in frames {width} px wide;"
+        f" {len(poses.sweep_w2c)} of {poses.n_sweep} sweep frames registered."
+        + "".join(
+            f" {name.capitalize()}: {print_.rms_m * 1000:.2f} mm RMS over {print_.n_corners} corners."
+            for name, print_ in prints.items()
+        )
+        + f" Metres by the {preparation.metric.scale_source}, up by the {preparation.metric.up_source}."
+        " Blue: training views; orange: held-out views."
+    )
+    rows = [
+        [
+            camera,
+            *(f"{value:.4f}" for value in centres[camera]),
+            f"{poses.centre_sigma[camera] * 1e3:.3f}" if camera in poses.centre_sigma else "unknown",
+            f"{poses.rotation_sigma_deg[camera]:.4f}" if camera in poses.rotation_sigma_deg else "unknown",
+        ]
+        for camera in centres
+    ]
+    header = ["camera", "x [m]", "y [m]", "z [m]", "± centre [mm]", "± rotation [deg]"]
+    note = "±: standard deviation relative to the other fixed cameras, from the noise of the features alone."
+    attempts = [f"Structure from motion tried more than once: {line}" for line in poses.attempts[:-1]]
+    return [
+        figure_html(figure),
+        f'<p class="note">{html.escape(text)}</p>',
+        table(header, rows),
+        f'<p class="note">{note}</p>',
+        *(bullets(attempts) if attempts else []),
+    ]
+
+
+def lenses_section(preparation: Preparation) -> list[str]:
+    """A table of the lenses, and where in the image their boards were seen."""
+    from matplotlib.figure import Figure
+
+    rows = []
+    for camera, calibration in preparation.calibrations.items():
+        K, distortion = calibration.lens.K, calibration.lens.distortion
+        rows.append(
+            [
+                camera,
+                f"{K[0, 0]:.2f}",
+                f"{K[1, 1]:.2f}",
+                f"{calibration.focal_sigma_px:.2f}",
+                f"{K[0, 2]:.1f}",
+                f"{K[1, 2]:.1f}",
+            ]
+            + [f"{value:.4f}" for value in distortion]
+            + [f"{calibration.rms_px:.3f}", f"{calibration.held_out_rms_px:.3f}", f"{calibration.coverage:.0%}"]
+            + [f"{calibration.n_views}/{calibration.n_detected}/{calibration.n_searched}"]
+        )
+    header = ["camera", "fx", "fy", "± f", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "RMS", "held out", "coverage"]
+    count = len(preparation.calibrations)
+    figure = Figure(figsize=(9, 1.6 * ((count + 3) // 4)), layout="constrained")
+    for index, (camera, calibration) in enumerate(preparation.calibrations.items()):
+        axes = figure.add_subplot((count + 3) // 4, 4, index + 1)
+        axes.scatter(calibration.view_points[:, 0], calibration.view_points[:, 1], s=0.5)
+        axes.set(
+            xlim=(0, calibration.lens.width),
+            ylim=(calibration.lens.height, 0),
+            aspect="equal",
+            title=f"camera {camera}",
+        )
+        axes.set_xticks(np.linspace(0, calibration.lens.width, COVERAGE_CELLS[0] + 1), labels=[])
+        axes.set_yticks(np.linspace(0, calibration.lens.height, COVERAGE_CELLS[1] + 1), labels=[])
+        axes.grid(linewidth=0.3)
+    note = (
+        "Pixels. Errors are RMS over corners. Views: used / with a board / searched. Below: all corners used, on the"
+        " cells that coverage counts."
+    )
+    return [table([*header, "views"], rows), f'<p class="note">{note}</p>', figure_html(figure)]
+
+
+def camera_centre(w2c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The centre [3] of a camera given world to camera [4, 4]."""
+    return np.asarray(-w2c[:3, :3].T @ w2c[:3, 3])

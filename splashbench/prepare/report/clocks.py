@@ -1,0 +1,118 @@
+"""Clocks and recordings in the report: offsets and drifts, the windows behind them, the sound's travel, the files."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splashbench.prepare.preparation import Preparation
+from splashbench.prepare.report.html import SWEEP_COLOUR, TRAIN_COLOUR, figure_html, table
+
+
+def clocks_section(preparation: Preparation) -> list[str]:
+    """A table of the clocks, the windows they were fitted to, and the sound's travel."""
+    offsets = preparation.sequence.offsets_s
+    rows = [
+        [
+            camera,
+            f"{fit.start_s:.6f}",
+            f"{(fit.clock_rate - 1) * 1e6:+.1f}",
+            "reference" if camera == preparation.session.reference else f"{fit.confidence:.1f}",
+            f"{fit.residual_rms_s * 1e6:.0f}",
+            str(fit.n_windows),
+            f"{offsets[camera] * 1e3:+.2f}" if camera in offsets else "unknown",
+        ]
+        for camera, fit in preparation.clocks.items()
+    ]
+    header = [
+        "camera",
+        "start [s]",
+        "drift [us/s]",
+        "confidence",
+        "scatter [us]",
+        "windows",
+        "residual in the sequence [ms]",
+    ]
+    note = (
+        "Reference time = start + (1 + drift) x local time. Residual in the sequence: the offset measured again within"
+        " the motion interval, less the mean over cameras. Below: every window of sound that a clock was fitted to, by"
+        " its delay from the clock's line. The scatter shows how well single windows agree; a bend would be a clock"
+        " whose rate changed."
+    )
+    return [
+        table(header, rows),
+        f'<p class="note">{note}</p>',
+        *_windows(preparation),
+        *_sound_paths(preparation),
+    ]
+
+
+def _windows(preparation: Preparation) -> list[str]:
+    """Where the windows' delays lie about every camera's clock."""
+    from matplotlib.figure import Figure
+
+    fitted = {camera: fit for camera, fit in preparation.clocks.items() if fit.windows}
+    if not fitted:
+        return []
+    columns = min(3, len(fitted))
+    rows = -(-len(fitted) // columns)
+    figure = Figure(figsize=(9, 1.9 * rows), layout="constrained")
+    for index, (camera, fit) in enumerate(fitted.items()):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        times, residuals = np.array(fit.windows).T
+        axes.axhline(0, color=SWEEP_COLOUR, linewidth=0.8)
+        axes.plot(times, residuals * 1e6, ".", color=TRAIN_COLOUR, markersize=3)
+        axes.set_title(f"camera {camera}", fontsize=9)
+        axes.set(xlabel="local time [s]", ylabel="delay [us]")
+        axes.tick_params(labelsize=8)
+    return [figure_html(figure)]
+
+
+def _sound_paths(preparation: Preparation) -> list[str]:
+    paths = preparation.sound_paths
+    rows = [
+        [camera, f"{paths.distance_m[camera]:.2f}", f"{paths.shift_s[camera] * 1e3:+.2f}"]
+        for camera in paths.distance_m
+    ]
+    place = "({:.2f}, {:.2f}, {:.2f}) m".format(*paths.source)
+    if paths.applied:
+        note = f"The sound came from {place}. The clocks above are corrected for its travel."
+    else:
+        note = (
+            "The clocks above go by the sound's arrival. Had it come from the scene's origin, its travel would shift"
+            " them as below. To correct for it, give [sound] source in session.toml."
+        )
+    header = ["camera", "path of the sound [m]", "shift of the clock [ms]"]
+    return [f'<p class="note">{note}</p>', table(header, rows)]
+
+
+def recordings_section(preparation: Preparation) -> list[str]:
+    """A table of the recordings of the pour."""
+    rows = []
+    for camera, video in preparation.synced.videos.items():
+        longer = video.audio_minus_video_s
+        seams = preparation.synced.seams[camera]
+        rows.append(
+            [
+                camera,
+                f"{video.width}x{video.height}",
+                f"{video.fps:.3f}",
+                str(video.n_frames),
+                f"{video.duration:.2f}",
+                video.codec,
+                video.timecode or "none",
+                "unknown" if longer is None else f"{longer * 1e3:+.2f}",
+                ", ".join(f"{seam.gap_s * 1e3:+.1f} ms at {seam.time_s:.1f} s" for seam in seams) or "none",
+            ]
+        )
+    header = [
+        "camera",
+        "size",
+        "fps",
+        "frames",
+        "seconds",
+        "codec",
+        "timecode",
+        "sound - video [ms]",
+        "gaps in the sound",
+    ]
+    return [table(header, rows)]

@@ -1,0 +1,139 @@
+"""prepare_report.html: the outcome of a preparation, on one page that needs nothing else.
+
+What needs a person's eye comes first: the gates, then masks on the frames, then cameras, lenses and clocks. The page
+tells of the scene alone, not of the run that made it, so that the same recordings always give the same bytes.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+
+from splashbench.prepare.container import PlacedContainer
+from splashbench.prepare.masks.sheet import fault_note, mask_sheet, sheet_times
+from splashbench.prepare.preparation import Preparation
+from splashbench.prepare.report.cameras import cameras_section, lenses_section
+from splashbench.prepare.report.clocks import clocks_section, recordings_section
+from splashbench.prepare.report.html import STYLE, bullets, figure_html, image_uri, section, table
+
+
+def html_report(preparation: Preparation) -> str:
+    """The whole page as text."""
+    session = preparation.session
+    warnings = len(preparation.warnings)
+    verdict = "All gates passed." if not warnings else f"{warnings} of {len(preparation.gates)} gates failed."
+    body = [
+        f"<h1>Preparation of {html.escape(session.name)}</h1>",
+        f"<p>{len(session.cameras)} cameras, {len(preparation.sampling.times)} timesteps from"
+        f" {preparation.motion.start:.3f} to {preparation.motion.end:.3f} s on the clock of camera"
+        f" {html.escape(session.reference)}. {verdict}</p>",
+        *section("Gates", _gates(preparation)),
+        *section(f"Masks ({preparation.masks.provider})", _masks(preparation)),
+        *section("Cameras", cameras_section(preparation)),
+        *(section("Container", _container(preparation.container, preparation)) if preparation.container else []),
+        *section("Lenses", lenses_section(preparation)),
+        *section("Clocks", clocks_section(preparation)),
+        *section("Motion interval", bullets(preparation.motion.reasons)),
+        *section("Recordings", recordings_section(preparation)),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>Preparation of {html.escape(session.name)}</title><style>{STYLE}</style></head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body></html>\n"
+    )
+
+
+def _gates(preparation: Preparation) -> list[str]:
+    rows = [
+        [
+            gate.name.replace("_", " "),
+            "unknown" if gate.value is None else f"{gate.value:.4g}",
+            f"{gate.side} {gate.limit:.4g}",
+            "passed" if gate.passed else "failed",
+            gate.detail,
+        ]
+        for gate in preparation.gates
+    ]
+    classes = ["passed" if gate.passed else "failed" for gate in preparation.gates]
+    return [table(["gate", "value", "limit", "outcome", "what it is"], rows, classes)]
+
+
+def _masks(preparation: Preparation) -> list[str]:
+    from matplotlib.figure import Figure
+
+    times = preparation.sampling.times
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    axes = figure.add_subplot()
+    for camera, areas in preparation.masks.areas.items():
+        style = "--" if camera in preparation.session.test else "-"
+        axes.plot(times, areas, style, label=camera, linewidth=1.2)
+    axes.set(xlabel="time [s]", ylabel="mask area [px]", ylim=(0, None))
+    axes.legend(title="camera", fontsize=8, ncols=2)
+    sheet_frames = sheet_times(
+        len(times), preparation.masks.faults, len(next(iter(preparation.pictures.sheet.values())))
+    )
+    sheet = mask_sheet(
+        f"{preparation.session.name}: masks ({preparation.masks.provider})",
+        [f"{t}: {times[t]:.3f} s" for t in sheet_frames],
+        preparation.pictures.sheet,
+        {camera: fault_note(faults, len(times)) for camera, faults in preparation.masks.faults.items()},
+    )
+    picture = f'<p><img alt="contact sheet of the masks" src="{image_uri(sheet)}"></p>'
+    rows = [
+        [
+            camera,
+            _frames(health.empty),
+            _frames(health.failed),
+            f"{window.width}x{window.height}",
+            f"({window.x0}, {window.y0})",
+        ]
+        for camera, health, window in (
+            (camera, preparation.masks.health[camera], preparation.windows[camera])
+            for camera in preparation.session.cameras
+        )
+    ]
+    header = ["camera", "empty frames", "failed frames", "image written", "its top left in the frame"]
+    return [figure_html(figure), table(header, rows), picture]
+
+
+def _frames(positions: Sequence[int]) -> str:
+    if not positions:
+        return "none"
+    listed = ", ".join(map(str, positions[:8]))
+    return listed if len(positions) <= 8 else f"{listed} and {len(positions) - 8} more"
+
+
+def _container(placed: PlacedContainer, preparation: Preparation) -> list[str]:
+    """Where the mesh lies: its projected outline (blue) on the mask's (amber), and how well they agree."""
+    placement = placed.placement
+    turns = {
+        "determined": "The masks determine its turn about the vertical axis.",
+        "repeats": f"{placement.equivalent_turns} turns about the vertical axis look the same; the nearest was taken.",
+        "free": "It looks the same at any turn about the vertical axis; its turn is that of the mesh file.",
+    }
+    rows = [
+        [
+            camera,
+            "held out" if camera in preparation.session.test else "training",
+            f"{projection.iou:.4f}",
+            "unknown" if projection.contour_rms_px is None else f"{projection.contour_rms_px:.2f}",
+            "unknown" if projection.contour_median_px is None else f"{projection.contour_median_px:.2f}",
+        ]
+        for camera, projection in placed.projections.items()
+    ]
+    sheet = [
+        f'<figure><img alt="camera {html.escape(camera)}" src="{image_uri(image)}">'
+        f"<figcaption>camera {html.escape(camera)}</figcaption></figure>"
+        for camera, image in preparation.pictures.overlays.items()
+    ]
+    ambiguous = " Another of its axes could be up as well; give up in [container]." if placement.up_is_ambiguous else ""
+    header = ["camera", "view", "IoU", "outline RMS [px]", "outline median [px]"]
+    return [
+        f'<p class="note">{turns[placement.turn]}{ambiguous} Only training views placed it. Blue: the mesh projected;'
+        " amber: the mask.</p>",
+        table(header, rows),
+        '<div class="sheet">',
+        *sheet,
+        "</div>",
+    ]
