@@ -25,8 +25,8 @@ from splashbench.prepare.calibration import stage as calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.undistort import Undistorter, pinhole_cameras
 from splashbench.prepare.masks import stage as masks
-from splashbench.prepare.masks.production import sam3_provider
 from splashbench.prepare.masks.provider import Mask
+from splashbench.prepare.masks.session_masks import sam3_provider
 from splashbench.prepare.poses import metric
 from splashbench.prepare.poses import stage as poses
 from splashbench.prepare.poses.rig import PosedRig, RigRecordings

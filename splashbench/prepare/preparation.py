@@ -13,7 +13,7 @@ from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.crop import PixelBox
 from splashbench.prepare.gates import Gate
-from splashbench.prepare.masks.production import MaskRecord
+from splashbench.prepare.masks.session_masks import MaskRecord
 from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.poses.structure_from_motion import Poses
 from splashbench.prepare.scene_output import ReportPictures

@@ -16,8 +16,8 @@ from splashbench.files import sha256_file
 from splashbench.prepare.calibration.undistort import Undistorter
 from splashbench.prepare.container import PlacedContainer, put_into_scene
 from splashbench.prepare.crop import PixelBox
-from splashbench.prepare.masks.production import MaskRecord, MaskStore
 from splashbench.prepare.masks.provider import Mask
+from splashbench.prepare.masks.session_masks import MaskRecord, MaskStore
 from splashbench.prepare.masks.sheet import SheetCell, sheet_times, small_cell
 from splashbench.prepare.poses import metric
 from splashbench.prepare.poses.structure_from_motion import Poses

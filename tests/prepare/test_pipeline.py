@@ -356,7 +356,7 @@ def _centre(w2c: list[list[float]]) -> np.ndarray:
 
 def test_masks_folder_option_must_be_a_folder(session: Path, tmp_path: Path) -> None:
     write_png(tmp_path / "masks.png", np.zeros((4, 4), np.uint8))
-    from splashbench.prepare.masks.production import choose_provider
+    from splashbench.prepare.masks.session_masks import choose_provider
     from splashbench.prepare.session import Session
 
     with pytest.raises(SplashbenchError, match=r"masks\.png is not a folder of masks"):

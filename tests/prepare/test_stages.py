@@ -27,7 +27,7 @@ from splashbench.prepare.calibration.board import BoardView
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.container import PlacedContainer
-from splashbench.prepare.masks.production import CameraMasks
+from splashbench.prepare.masks.session_masks import CameraMasks
 from splashbench.prepare.poses.metric import MetricFrame, Sighting
 from splashbench.prepare.poses.rig import PosedRig
 from splashbench.prepare.poses.scale import SceneFrame

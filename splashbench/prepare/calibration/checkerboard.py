@@ -1,13 +1,16 @@
 """Finding a plain checkerboard in an image, and numbering its corners alike in every image.
 
-The board is searched in a shrunk image by the sector-based detector of Duda and Frese (BMVC 2018), and where that
-finds nothing by OpenCV's older one; the corners are then refined in the image itself. A checkerboard lacks the marks
-that number a ChArUco board. Its colours tell a half turn apart where one side counts an odd and the other an even
-number of squares: the first corner is then the one beside a dark outermost square (a light one if `inverted`), with x
-to the right and y down as the board faces the camera. Otherwise the board looks the same after a half turn, and a
-square board of odd count after a quarter turn: each view is numbered so that x runs as nearly as possible to the right
-in its image. The intrinsics do not mind. Where corners of several views are matched by number, `numbered_alike` turns
-the views to agree; which of the turns they agree on stays open, and so does the scene's direction of x.
+Detection: the sector-based detector of Duda and Frese (BMVC 2018) searches a shrunk image, and OpenCV's older one where
+that detects nothing. The corners are then refined in the image itself.
+
+Numbering: a checkerboard lacks the marks that number a ChArUco board. Where one side counts an odd and the other an
+even number of squares, its colours tell a half turn apart: the first corner is the one beside a dark outermost square
+(a light one if `inverted`), with x to the right and y down as the board faces the camera. Otherwise the board looks the
+same after a half turn, and a square board of odd count after a quarter turn. Each view is then numbered so that x runs
+as nearly as possible to the right in its image.
+
+The intrinsics do not depend on it. Where corners of several views are matched by number, `numbered_alike` turns the
+views to agree. Which of the turns they agree on stays open, and so does the scene's direction of x.
 """
 
 from __future__ import annotations

@@ -4,11 +4,12 @@ Of a raw mask R and a refined mask A of one frame of one camera, with union U = 
 
     IoU = |R & A| / |U|,    added = |A \\ R| / |U|,    removed = |R \\ A| / |U|,
 
-so IoU + added + removed = 1. The paper's figures are means over masks: its mean IoU 0.772, 20.1% "of the union added"
-and 2.7% removed add up to one, which totals over all pixels would not do with a mean of ratios. A pair without any
-liquid has no IoU and is left out of these, counted as `n_blank`. The empty share is that of the raw masks with not one
-pixel, all counted. Touched pixels (|A \\ R| + |R \\ A|) and the coverage of either are shares of the frame, all frames
-counted.
+so IoU + added + removed = 1. The paper's figures are means over masks: its mean IoU of 0.772, 20.1% "of the union
+added" and 2.7% removed add up to one, as totals over all pixels would not.
+
+A pair without any liquid has no IoU and is left out of these; `n_blank` counts it. The empty share is that of raw masks
+without a pixel, over all masks. Touched pixels (|A \\ R| + |R \\ A|) and the coverage of either are shares of
+the frame, over all frames.
 """
 
 from __future__ import annotations

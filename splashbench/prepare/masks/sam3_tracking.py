@@ -1,8 +1,8 @@
 """Liquid followed through the frames of one camera from a person's clicks, by SAM3's memory of earlier frames.
 
-The frames with clicks come first and are the memory's anchors; from the earliest the rest follows forwards, then
-backwards, as in the library's own propagation. Frames come one by one and only what the memory can still reach is
-kept, so the length of a recording does not matter.
+The frames with clicks come first and are the memory's anchors. From the earliest of them the rest follows forwards,
+then backwards, as in the library's propagation. Frames come one by one, and only those that the memory can still reach
+stay loaded, so the length of a recording does not matter.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from functools import partial
 
 from splashbench.prepare.audio.sync import ClockFit
 from splashbench.prepare.calibration.undistort import Undistorter
-from splashbench.prepare.masks.production import (
+from splashbench.prepare.masks.session_masks import (
     CameraMasks,
     MaskRecord,
     MaskStore,

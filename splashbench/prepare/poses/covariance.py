@@ -1,12 +1,13 @@
 """How sure structure from motion is of each camera: standard deviations of centres and rotations.
 
 The inverse of the bundle adjustment's normal equations is the covariance of its poses (Triggs et al., "Bundle
-adjustment: a modern synthesis", 1999, Sec. 9), scaled by the residuals' own variance instead of an assumed pixel. The
-reconstruction is free by a similarity, so a covariance means something in a chosen gauge only. COLMAP's holds two
-cameras, which then seem exact and make the others seem worse. Here it is the fixed cameras' own mean: a deviation is
-what remains of the fixed cameras' errors after the similarity that best takes them away, an error of rotation by one
-radian counting as much as an error of place by the rig's radius. How sure the scale and the horizon are is another
-question, which the board, the marker or the measured distance answers (`scale`).
+adjustment: a modern synthesis", 1999, Sec. 9). It is scaled by the residuals' variance instead of an assumed pixel.
+
+A reconstruction is free by a similarity, so a covariance depends on the gauge. COLMAP's gauge fixes two cameras, which
+then seem exact and make the others seem worse. Here the gauge is the fixed cameras' mean. A deviation is what remains
+of their errors after the similarity that best removes them; a radian of rotation counts as much as the rig's radius of
+displacement. How sure the scale and the horizon are is another question, which the board, the marker or the measured
+distance answers (`scale`).
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ _PRINCIPAL = {"FULL_OPENCV": (2, 3), "OPENCV": (2, 3), "SIMPLE_RADIAL": (1, 2)}
 
 @dataclass(frozen=True)
 class PoseSigmas:
-    """Per image name: root mean square of the centre's error (units of the reconstruction) and of the rotation's
-    (degrees), over all three axes together."""
+    """Root mean square errors to expect by image name, over all three axes together.
+
+    Centres in units of the reconstruction, rotations in degrees.
+    """
 
     centre: dict[str, float] = field(default_factory=dict)
     rotation_deg: dict[str, float] = field(default_factory=dict)

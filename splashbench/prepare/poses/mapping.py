@@ -1,8 +1,8 @@
 """COLMAP's part of the poses: features, matches, incremental mapping, and a second try where it fails.
 
-COLMAP begins with the pair of images it likes best and accepts an image that shows enough of what is mapped already.
-Where a fixed camera is left out, the same matches are mapped again with lower thresholds, and then from other pairs;
-what was tried is part of the result. Features are SIFT on the CPU: the learned ones abort the process where their
+COLMAP begins with the pair of images that it ranks first, and accepts an image that shows enough of what is mapped
+already. Where a fixed camera is left out, the same matches are mapped again with lower thresholds, and then from other
+pairs; the attempts are part of the result. Features are SIFT on the CPU: the learned ones abort the process where their
 network's file is missing.
 """
 
@@ -56,7 +56,7 @@ class Workplace:
 
 @dataclass(frozen=True)
 class Mapped:
-    """A reconstruction, and how each attempt at one ended: the last is the one that is kept, or the best of all."""
+    """A reconstruction, and how each attempt at one ended; it is the last attempt's, or else the best one's."""
 
     reconstruction: pycolmap.Reconstruction
     attempts: tuple[str, ...]
@@ -164,8 +164,10 @@ def _write_lenses(database: Path, names: Mapping[str, str], lenses: Mapping[str,
 
 
 def map_images(workplace: Workplace) -> Mapped | None:
-    """The reconstruction with the most fixed cameras of up to five attempts; the first with all of them ends the
-    search, all, that is, that share enough matches with any other image. None where no attempt gave any."""
+    """The reconstruction with the most fixed cameras of up to five attempts; None where no attempt gave any.
+
+    The first with all fixed cameras that share enough matches with any other image ends the search.
+    """
     pairs = _verified_pairs(workplace)
     matched = {name for _, *both in pairs for _, name in both}
     reachable = len(matched.intersection(workplace.names.values()))
@@ -245,8 +247,8 @@ def _merit(model: pycolmap.Reconstruction, workplace: Workplace) -> tuple[int, i
 def refine(reconstruction: pycolmap.Reconstruction, workplace: Workplace) -> bool:
     """One last bundle adjustment over everything, in which the sweep's principal point is free; whether it was.
 
-    Held at the middle, where it seldom is, it bends the whole scene: 13 px off at 1280 px doubled the errors of the
-    fixed cameras. Many frames of one camera determine it; a camera with one image of its own does not.
+    Fixed at the middle, where it seldom is, it bends the scene: 13 px off at 1280 px doubled the errors of the fixed
+    cameras. Many frames of one camera determine it; a single image of a camera does not.
     """
     config = pycolmap.BundleAdjustmentConfig()
     n_images: dict[int, int] = {}

@@ -4,10 +4,10 @@ Up and origin: the marker, where session.toml has one; else the board, which the
 that was placed in the reconstruction and stands upright. A marker comes before the board because it is described only
 where the board does not lie flat in the static scene.
 
-Metres: the board, else the marker, else the measured distance between two cameras, else the container, by how exactly
-each is known: a print to a tenth of a millimetre with many corners, then with four, a distance between the centres of
-two lenses to millimetres, and a container by the outlines of its masks. All that there are are kept, since two that
-disagree show that one of them is wrong.
+Metres: the board, else the marker, else the measured distance between two cameras, else the container. The order is by
+how exactly each is known: a print to a tenth of a millimetre, with many corners before one with four; a distance
+between the centres of two lenses to millimetres; a container by the outlines of its masks. All are recorded, since two
+that disagree show that one of them is wrong.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class SceneFrame:
     @property
     def prints(self) -> dict[str, MetricFrame]:
         """What the prints in the scene gave, by name: the board, the marker."""
-        seen = {"board": self.board, "marker": self.marker}
-        return {name: found for name, found in seen.items() if found is not None}
+        frames = {"board": self.board, "marker": self.marker}
+        return {name: frame for name, frame in frames.items() if frame is not None}
 
     @property
     def scale_disagreement(self) -> float | None:
@@ -139,7 +139,7 @@ def choose_frame(
         scale_source=scale_source,
         up_source=up_source,
         scales={str(source): scale for source, scale in scales.items()},
-        scale_sigma={str(source): found.scale_sigma for source, found in prints.items()},
+        scale_sigma={str(source): print_frame.scale_sigma for source, print_frame in prints.items()},
         board=board,
         marker=marker,
     )

@@ -1,9 +1,9 @@
 """Clear glass between the camera and the room: what it lets through, and what it mirrors.
 
-The glass is one closed mesh with thick walls. It swallows light along the way through it (Beer-Lambert; soda-lime glass
-is faintly green), each of its faces mirrors the surroundings (Fresnel's reflectance after Schlick 1994), and along its
-edges it is ground: pale, and only half clear. It does not refract: rays go straight on, so that masks, cameras and
-truth agree to the pixel, and it casts no shadow.
+The glass is one closed mesh with thick walls. It absorbs light on the way through (Beer-Lambert; soda-lime glass is
+faintly green). Each of its faces mirrors the surroundings (Fresnel's reflectance after Schlick 1994). Along its edges
+it is ground: pale, and only half clear. It does not refract: rays go straight on, so that masks, cameras and truth
+agree to the pixel. It casts no shadow.
 """
 
 from __future__ import annotations
@@ -88,11 +88,11 @@ class Glass:
             light = directions[rays]
             first, first_mirrored = _face(light, way_in)
             second, second_mirrored = _face(light, way_out)
-            swallowed = np.exp(-ABSORPTION * (leaving - entry)[:, None])
+            absorbed = np.exp(-ABSORPTION * (leaving - entry)[:, None])
             panes.distance[rays, k] = entry
-            transmitted = swallowed * (1 - first) * (1 - second)
+            transmitted = absorbed * (1 - first) * (1 - second)
             # What the far face mirrors crosses the wall twice.
-            mirrored = first_mirrored + swallowed**2 * (1 - first) ** 2 * second_mirrored
+            mirrored = first_mirrored + absorbed**2 * (1 - first) ** 2 * second_mirrored
             ground = self._near_edge(eye + entry[:, None] * light)[:, None]
             panes.transmitted[rays, k] = np.where(ground, _GROUND_CLEAR * transmitted, transmitted)
             panes.mirrored[rays, k] = np.where(ground, mirrored + _GROUND_LIGHT, mirrored)
