@@ -48,9 +48,10 @@ from splashbench.progress import Bar
 from splashbench.scene import Scene
 from splashbench.scene.scene import TrainingScene
 from splashbench_methods.splashsplat.carriers.resampling import newborns
-from splashbench_methods.splashsplat.fields.observations import Observations
+from splashbench_methods.splashsplat.fields.observations import Observations, Report, observe
 from splashbench_methods.splashsplat.flip.solver import FlipSettings, FlipSolver, gravity_in_voxels
-from splashbench_methods.splashsplat.motion.step import Step
+from splashbench_methods.splashsplat.motion.observed_frames import observed_frames
+from splashbench_methods.splashsplat.motion.steps import FrameStep
 from splashbench_methods.splashsplat.settings import SplashSplatConfig
 
 VALID_VOXELS = 0.5
@@ -108,7 +109,7 @@ class State:
 
     t: int
     phi: np.ndarray
-    motion: Step
+    motion: FrameStep
     carriers: np.ndarray
     dt: float
     surroundings: Surroundings
@@ -155,18 +156,21 @@ PREDICTORS: dict[str, Predictor] = {
 
 
 def steps(
-    around: Surroundings, observations: Observations, every: int, seed: int
+    around: Surroundings, observations: Observations, report: Report, every: int, seed: int
 ) -> Iterator[tuple[State, np.ndarray]]:
     """Every `every`-th step with liquid before and after, and phi_{t+1} on the hull grid."""
     before: np.ndarray | None = None
-    for t, phi in enumerate(observations):
-        if before is not None and (t - 1) % every == 0 and (before < 0).any() and (phi < 0).any():
+    frames = observed_frames(observations, around.scene, around.config.motion, Run(), report)
+    for t, frame in enumerate(frames):
+        phi = frame.phi
+        wet = before is not None and (before < 0).any() and (phi < 0).any()
+        if before is not None and frame.step is not None and wet and (t - 1) % every == 0:
             rng = np.random.default_rng([seed, t - 1])
             nothing = np.zeros((0, 3), np.float32)
             carriers = newborns(before, around.grid, around.ratio, nothing, around.config.carriers.shell, rng)
             dt = float(around.scene.times[t] - around.scene.times[t - 1])
             if len(carriers):
-                yield State(t - 1, before, observations.motion.step(t - 1), carriers, dt, around), phi
+                yield State(t - 1, before, frame.step, carriers, dt, around), phi
         before = phi
 
 
@@ -181,12 +185,11 @@ def compare(
 ) -> dict[str, Any]:
     """The figures of one scene: predictor -> validity, escape, seconds and their values per step; and the steps."""
     bar = Bar(f"{scene.name}, {scene.n_frames} frames")
-    observations = Observations(scene, config, Run(), lambda done, message: bar.update(done, message))
-    ratio = observations.grid.voxel / observations.hull_grid.voxel
-    around = Surroundings(scene, observations, config, observations.grid, ratio)
+    observations = observe(scene, config.fields, Run(), bar.update)
+    around = Surroundings(scene, observations, config, observations.grid, observations.ratio)
     values: dict[str, dict[str, list[float]]] = {name: {"validity": [], "escape": [], "seconds": []} for name in chosen}
     frames, carriers = [], []
-    for state, after in steps(around, observations, every, seed):
+    for state, after in steps(around, observations, bar.update, every, seed):
         frames.append(state.t)
         carriers.append(len(state.carriers))
         for name in chosen:

@@ -8,33 +8,33 @@ from typing import ClassVar
 import numpy as np
 
 from splashbench.files import read_npz
-from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.density_control import DensityControl
 from splashbench.gaussians.fitting import fit_dynamic
-from splashbench.gaussians.mixed import MODEL_FILE, MixedFitted, load_tables
-from splashbench.gaussians.optimizer import Rate, RowOptimizer
+from splashbench.gaussians.initialization import camera_extent, initialization
+from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
+from splashbench.gaussians.optimizer import LearningRate, RowOptimizer
 from splashbench.gaussians.photographs import Photographs
-from splashbench.gaussians.start import camera_extent, started
 from splashbench.harness.contract import Method, MethodConfig, Run
 from splashbench.scene import TrainingScene
 
 from .model import ROWS, DeformableModel
-from .settings import Settings
+from .settings import DeformableSettings
 
 # Steps after which the published rates have come to their end; a fit of a real scene ends before, with 20 000.
 _POSITIONS_FALL_FOR, _NETWORK_FALLS_FOR = 30_000, 40_000
 
 
-def rates(settings: Settings, extent: float) -> dict[str, Rate]:
+def rates(settings: DeformableSettings, extent: float) -> dict[str, LearningRate]:
     """Learning rates by table; `extent` of the cameras, scene units."""
     factor, color = settings.rate_factor, 2.5e-3 * settings.color_factor
     position = 1.6e-4 * extent * factor
     published = {
-        "positions": Rate(position, position / 100, until=_POSITIONS_FALL_FOR / settings.iterations),
-        "log_scales": Rate.constant(5e-3),
-        "quaternions": Rate.constant(1e-3),
-        "opacity_logits": Rate.constant(0.05),
-        "constant": Rate.constant(color),
-        "rest": Rate.constant(color / 20),
+        "positions": LearningRate(position, position / 100, until=_POSITIONS_FALL_FOR / settings.iterations),
+        "log_scales": LearningRate.constant(5e-3),
+        "quaternions": LearningRate.constant(1e-3),
+        "opacity_logits": LearningRate.constant(0.05),
+        "constant": LearningRate.constant(color),
+        "rest": LearningRate.constant(color / 20),
     }
     parts = {
         "layers": 1.0,
@@ -45,7 +45,7 @@ def rates(settings: Settings, extent: float) -> dict[str, Rate]:
     for part, share in parts.items():
         network = settings.network_factor * share
         until = _NETWORK_FALLS_FOR / settings.iterations
-        published[f"deformation.{part}"] = Rate(8e-4 * network, 1.6e-6 * network, until, settings.warm_up)
+        published[f"deformation.{part}"] = LearningRate(8e-4 * network, 1.6e-6 * network, until, settings.warm_up)
     if settings.rates == "published":
         return published
     return {name: rate.short() for name, rate in published.items()}
@@ -57,12 +57,12 @@ class Deformable3DGS(Method):
     id: ClassVar[str] = "deformable_3dgs"
     title: ClassVar[str] = "Deformable-3DGS"
     version: ClassVar[str] = "3"  # since `quick` has fewer Gaussians, more steps and slower places
-    Config: ClassVar[type[MethodConfig]] = Settings
+    Config: ClassVar[type[MethodConfig]] = DeformableSettings
     mixed: ClassVar[bool] = True
 
-    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
+    def fit(self, scene: TrainingScene, config: DeformableSettings, run: Run) -> MixedFitted:
         # One canonical set for all times: points of several frames would all be there in every one.
-        with started(scene, config, run, largest_only=True) as (start, rng):
+        with initialization(scene, config, run, largest_only=True) as (start, rng):
             model = DeformableModel.from_start(
                 start, config.start_opacity, config.sh_degree, config.depth, config.width
             )
@@ -102,7 +102,7 @@ class Deformable3DGS(Method):
 class _TimeNoise:
     """Annealed smoothing of the time (Yang et al. 2024, Eq. 6): Gaussian noise that falls to nothing."""
 
-    def __init__(self, config: Settings, n_frames: int, rng: np.random.Generator) -> None:
+    def __init__(self, config: DeformableSettings, n_frames: int, rng: np.random.Generator) -> None:
         self._until = config.time_noise_until * config.iterations
         self._sigma = config.time_noise / (n_frames - 1) if n_frames > 1 else 0.0
         self._rng = rng

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from splashbench.gaussians import harmonics
-from splashbench.gaussians.splats import DynamicModel, Splats, rotation_matrices
-from splashbench.gaussians.start import Start
+from splashbench.gaussians import spherical_harmonics as harmonics
+from splashbench.gaussians.dynamic_model import DynamicModel, Splats, rotation_matrices
+from splashbench.gaussians.initialization import StartingPoints
 from splashbench.scene import Camera
 
 from .deformation import Deformation
@@ -26,7 +26,7 @@ _BOX = 1.3
 ROWS = ("positions", "log_scales", "quaternions", "opacity_logits", "constant", "rest")
 
 
-class State(NamedTuple):
+class DeformedGaussians(NamedTuple):
     """The Gaussians at an instant: means [N, 3], factors [N, 3, 3], opacities [N]."""
 
     means: Tensor
@@ -52,7 +52,9 @@ class DeformableModel(DynamicModel):
         self.deformation = Deformation(depth, width)
 
     @classmethod
-    def from_start(cls, start: Start, opacity: float, sh_degree: int, depth: int, width: int) -> DeformableModel:
+    def from_start(
+        cls, start: StartingPoints, opacity: float, sh_degree: int, depth: int, width: int
+    ) -> DeformableModel:
         """A model about to be fitted; the network's weights come from torch's generator."""
         model = cls(len(start), sh_degree, depth, width)
         model.backdrop = start.backdrop_tensor()
@@ -71,16 +73,16 @@ class DeformableModel(DynamicModel):
         """Axes [N, 3, 3] of Gaussians with these quaternions [N, 4], after the network's turn."""
         return rotation_matrices(quaternions)
 
-    def at(self, time: float) -> State:
+    def at(self, time: float) -> DeformedGaussians:
         quaternions = nn.functional.normalize(self.quaternions, dim=1)
         scales, means = torch.exp(self.log_scales), self.positions
         if self.deforms:
             shift, turn, growth = self.deformation(self.positions.detach(), time)
             means, quaternions, scales = means + shift, quaternions + turn, scales + growth
         factors = self.turned(quaternions) * scales[:, None]
-        return State(means, factors, torch.sigmoid(self.opacity_logits))
+        return DeformedGaussians(means, factors, torch.sigmoid(self.opacity_logits))
 
-    def splats(self, state: State, camera: Camera) -> Splats:
+    def splats(self, state: DeformedGaussians, camera: Camera) -> Splats:
         eye = torch.as_tensor(camera.center, dtype=torch.float32)
         directions = nn.functional.normalize(state.means.detach() - eye, dim=1)
         colors = harmonics.colors(self.constant, self.rest, directions, self.active_degree)

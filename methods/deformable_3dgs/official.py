@@ -24,18 +24,12 @@ from torch import Tensor, nn
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_model, read_npz, validate_model
-from splashbench.gaussians.mixed import MODEL_FILE, load_tables
+from splashbench.gaussians.dynamic_model import unit_quaternion_matrices
+from splashbench.gaussians.mixed_model import MODEL_FILE, load_tables
 from splashbench.gaussians.official.checkpoint import fill, read_weights
-from splashbench.gaussians.official.importer import (
-    NEAR,
-    Arguments,
-    OfficialFitted,
-    OfficialModel,
-    last_point_cloud,
-    require_finite,
-)
+from splashbench.gaussians.official.model import NEAR, OfficialFitted, OfficialModel, require_finite
+from splashbench.gaussians.official.output_folder import TrainingArguments, last_point_cloud
 from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
-from splashbench.gaussians.splats import unit_quaternion_matrices
 from splashbench.harness.external.importers import Importer
 from splashbench.scene import Camera, TrainingScene
 from splashbench.scene.export.nerfies import MICROSECONDS
@@ -48,7 +42,7 @@ _DEPTH, _WIDTH = 8, 256
 _SYNTHETIC_OCTAVES, _SYNTHETIC_FEATURES = 6, 30
 
 
-class _Box(BaseModel):
+class _NerfiesBox(BaseModel):
     """scene.json: the code's coordinates are (x - center) scale."""
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -56,14 +50,14 @@ class _Box(BaseModel):
     center: list[float] = Field(min_length=3, max_length=3)
 
 
-class _Split(BaseModel):
+class _NerfiesSplit(BaseModel):
     """dataset.json: ids of all the photographs that the code reads."""
 
     train_ids: list[str] = Field(min_length=1)
     val_ids: list[str]
 
 
-class _Photograph(BaseModel):
+class _NerfiesPhotograph(BaseModel):
     """An entry of metadata.json."""
 
     time_id: int = Field(ge=0)
@@ -72,7 +66,7 @@ class _Photograph(BaseModel):
 class _Metadata(BaseModel):
     """metadata.json, by id."""
 
-    photographs: dict[str, _Photograph]
+    photographs: dict[str, _NerfiesPhotograph]
 
 
 class OfficialDeformable(OfficialModel, DeformableModel):
@@ -102,14 +96,14 @@ class OfficialDeformable3DGS(Importer):
     def read(self, output: Path, export: Path, scene: TrainingScene) -> OfficialFitted:
         path = last_point_cloud(output)
         network = output / "deform" / path.parent.name / "deform.pth"
-        box = read_model(export / "scene.json", _Box)
+        box = read_model(export / "scene.json", _NerfiesBox)
         weights = read_weights(network)
         if any(name.startswith("branch_") for name in weights):
             raise SplashbenchError(f"{network} is of --is_6dof, whose rigid motions are not read; train without it")
         model = _gaussians(read_point_cloud(path), box, synthetic="timenet.0.weight" in weights)
         fill(_slots(model.deformation), weights, network)
         model.clock.copy_(torch.tensor(_clock(export), dtype=torch.float64))
-        if Arguments.read(output).flag("white_background"):
+        if TrainingArguments.read(output).flag("white_background"):
             model.background.fill_(1)
         return require_finite(OfficialFitted(model, scene), path)
 
@@ -122,7 +116,7 @@ class OfficialDeformable3DGS(Importer):
         return OfficialFitted(model, scene)
 
 
-def _gaussians(cloud: PointCloud, box: _Box, synthetic: bool) -> OfficialDeformable:
+def _gaussians(cloud: PointCloud, box: _NerfiesBox, synthetic: bool) -> OfficialDeformable:
     """The cloud's Gaussians in scene units; the network's weights are still to come."""
     rest = cloud.count("f_rest_")
     degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(rest)
@@ -158,7 +152,7 @@ def _slots(network: Deformation) -> dict[str, Tensor]:
 
 def _clock(export: Path) -> tuple[float, float]:
     """Origin and unit of the code's clock, seconds: at its time 1 is the last of the photographs that it reads."""
-    split, path = read_model(export / "dataset.json", _Split), export / "metadata.json"
+    split, path = read_model(export / "dataset.json", _NerfiesSplit), export / "metadata.json"
     photographs = validate_model(path, _Metadata, {"photographs": read_json(path)}).photographs
     missing = [name for name in split.train_ids + split.val_ids if name not in photographs]
     if missing:

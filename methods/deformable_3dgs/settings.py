@@ -10,7 +10,7 @@ from pydantic import Field
 from splashbench.gaussians.settings import SplattingSettings
 
 
-class Settings(SplattingSettings):
+class DeformableSettings(SplattingSettings):
     """How canonical Gaussians and their deformation are fitted; besides what all baselines share:
 
     Attributes:
@@ -27,15 +27,15 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 8000, "views_per_step": 1, "static_points": 2500, "hull_points": 2500, "most": 6000,
+            "iterations": 8000, "views_per_step": 1, "static_points": 2500, "hull_points": 2500, "max_gaussians": 6000,
             "color_factor": 4.0, "warm_up": 0.02, "depth": 4, "width": 64, "network_factor": 4.0, "head_factor": 0.03,
             "growth_factor": 0.003, "network_steps": "muon",
         },
         "paper": {
             "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "time_noise_until": 1.0, "depth": 8,
             "width": 256, "sh_degree": 3, "sh_every": 1000, "static": "points", "static_points": 100_000,
-            "hull_points": 100_000, "start_opacity": 0.1, "most": 500_000, "grow_from": 0.025, "grow_until": 0.75,
-            "prune_until": 0.75, "reset_every": 3000, "reset_until": 0.75, "rates": "published",
+            "hull_points": 100_000, "start_opacity": 0.1, "max_gaussians": 500_000, "grow_from": 0.025,
+            "grow_until": 0.75, "prune_until": 0.75, "reset_every": 3000, "reset_until": 0.75, "rates": "published",
             "longest_side": 16384,
         },
     }  # fmt: skip

@@ -14,17 +14,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splashbench.gaussians.screen import screen_gradients
-from splashbench.gaussians.splats import Splats
+from splashbench.gaussians.dynamic_model import Splats
+from splashbench.gaussians.screen_gradients import screen_gradients
 from splashbench.scene import Camera
 
-from ..scaffold_gs.cells import Level
+from ..scaffold_gs.cells import GrowthLevel
 from ..scaffold_gs.growth import AnchorGrowth, GrowthRules
 from ..scaffold_gs.optimizer import AnchorOptimizer
 from .model import AnchorSplats
-from .settings import Settings
+from .settings import Scaffold4DSettings
 
-LEVELS = (Level(16.0, 1.0, 0.5), Level(4.0, 2.0, 0.75), Level(1.0, 4.0, 0.875))
+LEVELS = (GrowthLevel(16.0, 1.0, 0.5), GrowthLevel(4.0, 2.0, 0.75), GrowthLevel(1.0, 4.0, 0.875))
 
 
 class SpacetimeGrowth(AnchorGrowth):
@@ -32,10 +32,15 @@ class SpacetimeGrowth(AnchorGrowth):
     recording."""
 
     def __init__(
-        self, optimizer: AnchorOptimizer, voxel: float, frame: float, settings: Settings, rng: np.random.Generator
+        self,
+        optimizer: AnchorOptimizer,
+        voxel: float,
+        frame: float,
+        settings: Scaffold4DSettings,
+        rng: np.random.Generator,
     ) -> None:
         views = settings.grow_every * settings.views_per_step
-        rules = GrowthRules(views, settings.grow_gradient, settings.prune_opacity, settings.most)
+        rules = GrowthRules(views, settings.grow_gradient, settings.prune_opacity, settings.max_anchors)
         super().__init__(optimizer, np.array([voxel, voxel, voxel, frame]), LEVELS, rules, rng, np.float32)
         self._from, self._until, self._every = (
             round(settings.grow_from * settings.iterations),

@@ -8,25 +8,25 @@ from typing import ClassVar
 import numpy as np
 
 from splashbench.gaussians.fitting import fit_dynamic
-from splashbench.gaussians.mixed import MODEL_FILE, MixedFitted, load_tables
-from splashbench.gaussians.optimizer import Rate
+from splashbench.gaussians.initialization import camera_extent, initialization
+from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
+from splashbench.gaussians.optimizer import LearningRate
 from splashbench.gaussians.photographs import Photographs, unit_time
-from splashbench.gaussians.start import camera_extent, started
 from splashbench.harness.contract import Method, MethodConfig, Run
 from splashbench.scene import TrainingScene
 
 from ..scaffold_gs.model import PER_ANCHOR
 from ..scaffold_gs.optimizer import RATES, AnchorOptimizer
 from .growth import SpacetimeGrowth
-from .model import ROWS, SpacetimeAnchors, Variant, stored_children
-from .settings import Settings
+from .model import ROWS, SpacetimeAnchors, SpacetimeAnchorSpec, stored_children
+from .settings import Scaffold4DSettings
 
 
-def rates(settings: Settings) -> dict[str, Rate]:
+def rates(settings: Scaffold4DSettings) -> dict[str, LearningRate]:
     """Learning rates by table: those of static anchors, and of the flow."""
-    found = {**RATES[settings.rates], "flow_head": Rate.constant(1e-3)}
+    found = {**RATES[settings.rates], "flow_head": LearningRate.constant(1e-3)}
     factor = settings.rate_factor
-    found |= {name: Rate(found[name].first * factor, found[name].last * factor) for name in PER_ANCHOR}
+    found |= {name: LearningRate(found[name].first * factor, found[name].last * factor) for name in PER_ANCHOR}
     return found if settings.rates == "published" else {name: rate.short() for name, rate in found.items()}
 
 
@@ -36,15 +36,15 @@ class Scaffold4D(Method):
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
     version: ClassVar[str] = "2"  # since short fits hold their rates and come to rest
-    Config: ClassVar[type[MethodConfig]] = Settings
+    Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
     mixed: ClassVar[bool] = True
 
-    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
-        with started(scene, config, run) as (start, rng):
+    def fit(self, scene: TrainingScene, config: Scaffold4DSettings, run: Run) -> MixedFitted:
+        with initialization(scene, config, run) as (start, rng):
             times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
             seconds, frame = float(scene.times[-1] - scene.times[0]) or 1.0, 1 / max(1, scene.n_frames - 1)
             fastest = config.fastest * camera_extent(scene) * seconds
-            variant = Variant(config.children, config.beta, fastest, config.base_color)
+            variant = SpacetimeAnchorSpec(config.children, config.beta, fastest, config.base_color)
             model = SpacetimeAnchors.from_start(start, variant, config.start_opacity, config.duration * frame, times)
             optimizer = AnchorOptimizer(model, rates(config), config.iterations)
             voxel = config.voxel * float(np.median(start.spacing))
@@ -60,6 +60,6 @@ class Scaffold4D(Method):
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         path = directory / MODEL_FILE
-        model = SpacetimeAnchors(0, Variant(stored_children(path)))
+        model = SpacetimeAnchors(0, SpacetimeAnchorSpec(stored_children(path)))
         load_tables(path, model, ROWS)
         return MixedFitted(model, scene)

@@ -26,8 +26,8 @@ from torch import Tensor, nn
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
-from splashbench.gaussians.splats import DynamicModel, Splats, rotation_matrices
-from splashbench.gaussians.start import Start
+from splashbench.gaussians.dynamic_model import DynamicModel, Splats, rotation_matrices
+from splashbench.gaussians.initialization import StartingPoints
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
 
@@ -43,7 +43,7 @@ MAX_CHILDREN = 1024
 
 
 @dataclass(frozen=True)
-class Variant:
+class SpacetimeAnchorSpec:
     """What kind of model. children: K. beta: of the fading in time. fastest: v_max, scene units per recording."""
 
     children: int = 10
@@ -61,7 +61,7 @@ def stored_children(path: Path) -> int:
 
 
 @dataclass
-class State:
+class AnchorInstant:
     """The n anchors that show at an instant, by number, and their children, M = n K.
 
     anchors: [n]; features: [n, F], theirs. means [M, 3], factors [M, 3, 3], opacities [M]; fading [M] is alpha / rho,
@@ -83,7 +83,7 @@ class State:
 class AnchorSplats(Splats):
     """Splats with the state that they come from."""
 
-    state: State | None = None
+    state: AnchorInstant | None = None
 
 
 class SpacetimeAnchors(Anchors, DynamicModel):
@@ -94,7 +94,7 @@ class SpacetimeAnchors(Anchors, DynamicModel):
     base_color: Tensor
     unit: Tensor
 
-    def __init__(self, n: int, variant: Variant) -> None:
+    def __init__(self, n: int, variant: SpacetimeAnchorSpec) -> None:
         super().__init__(n, variant.children, 4)
         k = variant.children
         self.register_buffer("beta", torch.tensor(variant.beta))
@@ -109,7 +109,7 @@ class SpacetimeAnchors(Anchors, DynamicModel):
 
     @classmethod
     def from_start(
-        cls, start: Start, variant: Variant, opacity: float, duration: float, times: np.ndarray
+        cls, start: StartingPoints, variant: SpacetimeAnchorSpec, opacity: float, duration: float, times: np.ndarray
     ) -> SpacetimeAnchors:
         """A model about to be fitted; random numbers come from torch's generator.
 
@@ -159,7 +159,7 @@ class SpacetimeAnchors(Anchors, DynamicModel):
         # With a margin: what is left out here is fainter than what the renderer leaves out.
         return torch.nonzero((peaks * fading >= 0.9 * MIN_ALPHA).any(dim=1))[:, 0], peaks
 
-    def at(self, time: float) -> State:
+    def at(self, time: float) -> AnchorInstant:
         anchors, peaks = self._shown(time)
         n, k = len(anchors), self.offsets.shape[1]
         # Picked once for all views: the gradient of a pick is a table of all anchors.
@@ -174,7 +174,7 @@ class SpacetimeAnchors(Anchors, DynamicModel):
         axes = (scales[:, None, 4:7] * torch.sigmoid(shape[..., :3])).view(-1, 3)
         drawn = opacities.detach() >= MIN_ALPHA
         volumes = (axes / self.unit).prod(dim=1) * drawn
-        return State(
+        return AnchorInstant(
             anchors=anchors,
             features=features,
             means=self._moved(positions, features, offsets, scales, since),
@@ -197,7 +197,7 @@ class SpacetimeAnchors(Anchors, DynamicModel):
         since = _since(self.positions, self.offsets, scales, time)
         return self._moved(self.positions, self.features, self.offsets, scales, since)
 
-    def splats(self, state: State, camera: Camera) -> AnchorSplats:
+    def splats(self, state: AnchorInstant, camera: Camera) -> AnchorSplats:
         n, k = len(state.anchors), self.offsets.shape[1]
         eye = torch.as_tensor(camera.center, dtype=torch.float32)
         directions = nn.functional.normalize(self.positions[state.anchors, :3] - eye, dim=1)

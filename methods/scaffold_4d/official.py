@@ -25,15 +25,10 @@ from torch import Tensor, nn
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_model
-from splashbench.gaussians.mixed import MODEL_FILE, load_tables
+from splashbench.gaussians.mixed_model import MODEL_FILE, load_tables
 from splashbench.gaussians.official.checkpoint import fill, read_weights
-from splashbench.gaussians.official.importer import (
-    Arguments,
-    OfficialFitted,
-    OfficialModel,
-    last_point_cloud,
-    require_finite,
-)
+from splashbench.gaussians.official.model import OfficialFitted, OfficialModel, require_finite
+from splashbench.gaussians.official.output_folder import TrainingArguments, last_point_cloud
 from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
 from splashbench.harness.external.importers import Importer
 from splashbench.render.constants import BLUR_VARIANCE, JACOBIAN_MARGIN
@@ -41,7 +36,15 @@ from splashbench.scene import Camera, TrainingScene
 from splashbench.scene.export.records import FACTS, ExportFacts
 
 from ..scaffold_gs.model import FEATURES
-from .model import MAX_CHILDREN, ROWS, AnchorSplats, SpacetimeAnchors, State, Variant, stored_children
+from .model import (
+    MAX_CHILDREN,
+    ROWS,
+    AnchorInstant,
+    AnchorSplats,
+    SpacetimeAnchors,
+    SpacetimeAnchorSpec,
+    stored_children,
+)
 
 _HEADS = {"opacity_mlp": "opacity_head", "cov_mlp": "shape_head", "flow_mlp": "flow_head", "color_mlp": "color_head"}
 #: Options that change what the networks read; none of them is in the published scripts.
@@ -56,7 +59,7 @@ class OfficialAnchors(OfficialModel, SpacetimeAnchors):
 
     squared: Tensor
 
-    def __init__(self, n: int, variant: Variant) -> None:
+    def __init__(self, n: int, variant: SpacetimeAnchorSpec) -> None:
         super().__init__(n, variant)
         self.register_buffer("squared", torch.tensor(False))
 
@@ -66,7 +69,7 @@ class OfficialAnchors(OfficialModel, SpacetimeAnchors):
         sigma = nn.functional.elu(raw) + 1
         return torch.exp(-(since**2) * sigma), sigma
 
-    def splats(self, state: State, camera: Camera) -> AnchorSplats:
+    def splats(self, state: AnchorInstant, camera: Camera) -> AnchorSplats:
         splats = super().splats(state, camera)
         assert isinstance(splats, AnchorSplats)  # of SpacetimeAnchors, the second base
         children = self.offsets.shape[1]
@@ -127,7 +130,7 @@ class OfficialScaffold4D(Importer):
     mixed: ClassVar[bool] = True
 
     def read(self, output: Path, export: Path, scene: TrainingScene) -> OfficialFitted:
-        path, arguments = last_point_cloud(output), Arguments.read(output)
+        path, arguments = last_point_cloud(output), TrainingArguments.read(output)
         fading = arguments.text("temporal_opacity")
         if arguments.number("appearance_dim") != 0:
             raise SplashbenchError(
@@ -153,7 +156,7 @@ class OfficialScaffold4D(Importer):
 
     def load(self, directory: Path, scene: TrainingScene) -> OfficialFitted:
         path = directory / MODEL_FILE
-        model = OfficialAnchors(0, Variant(stored_children(path)))
+        model = OfficialAnchors(0, SpacetimeAnchorSpec(stored_children(path)))
         load_tables(path, model, ROWS)
         return OfficialFitted(model, scene)
 
@@ -167,7 +170,7 @@ def _anchors(cloud: PointCloud, beta: float, fastest: float) -> OfficialAnchors:
             f"{cloud.path} has {offsets} properties f_offset_ and {features} f_anchor_feat_, not 4 per Gaussian and "
             f"{FEATURES}; train with the published sizes"
         )
-    model = OfficialAnchors(len(cloud), Variant(children, beta, fastest, base_color=False))
+    model = OfficialAnchors(len(cloud), SpacetimeAnchorSpec(children, beta, fastest, base_color=False))
     scales = cloud.numbered("scale_", 8)
     scales[:, 7] = 0  # which the code leaves unused
     tables = {

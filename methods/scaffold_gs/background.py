@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splashbench.background.clean_plate import MAX_FRAMES, Plate, make_plate
+from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clean_plate
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, read_npz
-from splashbench.gaussians.anchors import AnchorSeed, seed_anchors, sparse_anchors
+from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.render import rasterize_arrays
 from splashbench.scene import Camera, TrainingScene
 
 from .fitting import fit_model, supervised_anchors
-from .model import AnchorModel, Variant, to_arrays
+from .model import AnchorModel, StaticAnchorSpec, to_arrays
 from .settings import BackgroundSettings
 
 _FILE = "background.npz"
@@ -73,7 +73,9 @@ class Background:
         n, children = len(fixed["positions"]), int(fixed["children"])
         if not 1 <= children <= 1024:
             raise SplashbenchError(f"{path}: {children} children per anchor make no sense; fit the background again")
-        model = AnchorModel(n, Variant(children, bool(fixed["view_dependent_shape"]), bool(fixed["base_color"])))
+        model = AnchorModel(
+            n, StaticAnchorSpec(children, bool(fixed["view_dependent_shape"]), bool(fixed["base_color"]))
+        )
         state = model.state_dict()
         arrays = read_npz(path, {name: tensor.ndim for name, tensor in state.items()})
         try:
@@ -97,10 +99,10 @@ def fit_background(
 
     points = _initial_points(scene, settings)
     n_frames = 1 if settings.frames == "first" else MAX_FRAMES
-    plates: list[Plate] = []
+    plates: list[CleanPlate] = []
     for i, name in enumerate(scene.train):
         progress(0.05 * i / len(scene.train), "liquid-free plates")
-        plate = make_plate(scene, name, settings.longest_side, n_frames)
+        plate = make_clean_plate(scene, name, settings.longest_side, n_frames)
         # A view that is liquid throughout says nothing, and has no loss.
         if plate.seen.any():
             plates.append(plate)
@@ -128,9 +130,9 @@ def _initial_points(scene: TrainingScene, settings: BackgroundSettings) -> NDArr
 
 
 def _seed(
-    points: NDArray[np.float32] | None, plates: list[Plate], settings: BackgroundSettings, random_seed: int
+    points: NDArray[np.float32] | None, plates: list[CleanPlate], settings: BackgroundSettings, random_seed: int
 ) -> AnchorSeed:
     if settings.start == "points":
         assert points is not None
-        return sparse_anchors(points, settings.anchors)
-    return seed_anchors(points, plates, settings.anchors, np.random.default_rng(random_seed))
+        return sparse_anchors(points, settings.max_anchors)
+    return seed_anchors(points, plates, settings.max_anchors, np.random.default_rng(random_seed))

@@ -16,7 +16,7 @@ _CELL_LIMIT = 1 << 20
 
 
 @dataclass(frozen=True)
-class Level:
+class GrowthLevel:
     """Cells of `size` times the finest, for pulls of `factor` times the threshold; `kept`: share of the candidates."""
 
     size: float
@@ -38,7 +38,7 @@ def new_cells(
     pulls: NDArray[np.floating],
     anchors: NDArray[np.float64],
     finest: NDArray[np.float64],
-    levels: Sequence[Level],
+    levels: Sequence[GrowthLevel],
     threshold: float,
     room: int,
     rng: np.random.Generator,

@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splashbench.background.clean_plate import Plate, shrunk
+from splashbench.background.clean_plate import CleanPlate, shrunk
 from splashbench.errors import SplashbenchError
-from splashbench.gaussians.anchors import AnchorSeed
-from splashbench.gaussians.losses import l1
+from splashbench.gaussians.anchor_seeds import AnchorSeed
+from splashbench.gaussians.color_loss import l1
 from splashbench.gaussians.ssim import SsimTarget, ssim
 from splashbench.render import rasterize
 
 from .growth import Growth
-from .model import PER_ANCHOR, AnchorModel, Variant
+from .model import PER_ANCHOR, AnchorModel, StaticAnchorSpec
 from .optimizer import AnchorOptimizer
 from .settings import BackgroundSettings
 
@@ -38,7 +38,7 @@ _MIN_PIXELS = 0.5
 class _Views:
     """The plates at one size, in random order, each once before any comes again."""
 
-    def __init__(self, plates: list[Plate], longest_side: int, rng: np.random.Generator) -> None:
+    def __init__(self, plates: list[CleanPlate], longest_side: int, rng: np.random.Generator) -> None:
         self.plates = [shrunk(plate, longest_side) for plate in plates]
         self._rng, self._order = rng, list[int]()
         self._kept: dict[int, SsimTarget] = {}
@@ -74,7 +74,7 @@ def pyramid(longest_side: int, coarse_side: int, iterations: int) -> dict[int, i
 
 def fit_model(
     seed: AnchorSeed,
-    plates: list[Plate],
+    plates: list[CleanPlate],
     settings: BackgroundSettings,
     far_color: NDArray[np.float32],
     random_seed: int,
@@ -87,7 +87,7 @@ def fit_model(
     rng = np.random.default_rng(random_seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(random_seed)
-        variant = Variant(settings.children, settings.view_dependent_shape, settings.base_color)
+        variant = StaticAnchorSpec(settings.children, settings.view_dependent_shape, settings.base_color)
         model = AnchorModel.from_seed(seed, variant)
         optimizer = AnchorOptimizer(model, settings.rates, settings.iterations)
         growth = Growth(optimizer, seed.voxel, settings, rng)
@@ -129,7 +129,7 @@ def fit_model(
     return model
 
 
-def supervised_anchors(model: AnchorModel, plates: list[Plate]) -> AnchorModel:
+def supervised_anchors(model: AnchorModel, plates: list[CleanPlate]) -> AnchorModel:
     """The model without the anchors that no seen pixel of any training view vouches for.
 
     Left in, they show in test views as black blobs (under liquid that never left) and as haze (beyond the edges of the

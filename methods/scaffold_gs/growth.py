@@ -17,16 +17,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splashbench.gaussians.screen import screen_gradients
+from splashbench.gaussians.screen_gradients import screen_gradients
 from splashbench.scene import Camera
 
-from .cells import Level, NewCells, new_cells
-from .model import AnchorModel, Anchors, Gaussians, random_offsets
+from .cells import GrowthLevel, NewCells, new_cells
+from .model import AnchorModel, Anchors, DecodedGaussians, random_offsets
 from .optimizer import AnchorOptimizer
 from .settings import BackgroundSettings
 
 # The paper leaves the share that is kept open.
-LEVELS = (Level(16.0, 1.0, 0.5), Level(4.0, 2.0, 0.5), Level(1.0, 4.0, 0.5))
+LEVELS = (GrowthLevel(16.0, 1.0, 0.5), GrowthLevel(4.0, 2.0, 0.5), GrowthLevel(1.0, 4.0, 0.5))
 # Visits before a mean counts, as shares of the views between two rounds.
 _GROW_VISITS, _PRUNE_VISITS = 0.4, 0.8
 
@@ -36,13 +36,13 @@ class GrowthRules:
     """What makes an anchor come or go.
 
     views: rendered between two rounds. gradient: tau_g. opacity: an anchor whose children's mean opacities add up to
-    less goes. most: anchors at most.
+    less goes. max_anchors: anchors at most.
     """
 
     views: int
     gradient: float
     opacity: float
-    most: int
+    max_anchors: int
 
 
 class AnchorGrowth(ABC):
@@ -55,7 +55,7 @@ class AnchorGrowth(ABC):
         self,
         optimizer: AnchorOptimizer,
         finest: NDArray[np.float64],
-        levels: Sequence[Level],
+        levels: Sequence[GrowthLevel],
         rules: GrowthRules,
         rng: np.random.Generator,
         counted: Any = np.int32,
@@ -125,7 +125,7 @@ class AnchorGrowth(ABC):
             self.finest,
             self.levels,
             self.rules.gradient,
-            self.rules.most - len(model.positions),
+            self.rules.max_anchors - len(model.positions),
             self._rng,
         )
 
@@ -136,7 +136,7 @@ class Growth(AnchorGrowth):
     def __init__(
         self, optimizer: AnchorOptimizer, voxel: float, settings: BackgroundSettings, rng: np.random.Generator
     ) -> None:
-        rules = GrowthRules(settings.grow_every, settings.grow_gradient, settings.prune_opacity, settings.anchors)
+        rules = GrowthRules(settings.grow_every, settings.grow_gradient, settings.prune_opacity, settings.max_anchors)
         super().__init__(optimizer, np.full(3, voxel), LEVELS, rules, rng)
         self.voxel = voxel
 
@@ -145,7 +145,7 @@ class Growth(AnchorGrowth):
         assert isinstance(self.anchors, AnchorModel)
         return self.anchors
 
-    def observe(self, camera: Camera, gaussians: Gaussians) -> None:
+    def observe(self, camera: Camera, gaussians: DecodedGaussians) -> None:
         """Take note of a step; `gaussians.means` has kept the gradient of its loss."""
         assert gaussians.means.grad is not None
         gradients = gaussians.means.grad.numpy()

@@ -11,8 +11,8 @@ from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, R
 from splashbench.scene import Camera, Particles, TrainingScene
 
 from .background import Background
+from .background_reuse import shared_background
 from .settings import BackgroundSettings
-from .shared import shared_background
 
 
 class StaticScene(Fitted):

@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from splashbench.gaussians.anchors import AnchorSeed
-from splashbench.gaussians.splats import rotation_matrices
+from splashbench.gaussians.anchor_seeds import AnchorSeed
+from splashbench.gaussians.dynamic_model import rotation_matrices
 
 FEATURES = 32
 HIDDEN = 32
@@ -33,7 +33,7 @@ PER_ANCHOR = ("features", "offsets", "log_scales")
 
 
 @dataclass(frozen=True)
-class Variant:
+class StaticAnchorSpec:
     """What kind of model: children per anchor K, and the two departures that the module names."""
 
     children: int
@@ -41,7 +41,7 @@ class Variant:
     base_color: bool = True
 
 
-class Gaussians(NamedTuple):
+class DecodedGaussians(NamedTuple):
     """All children of N anchors, M = N K, as seen from one point; child c of anchor i is row i K + c.
 
     means [M, 3], factors [M, 3, 3] (covariances B B^T), opacities [M] (0 or less: not drawn), colors [M, 3], scales
@@ -79,7 +79,7 @@ class Anchors(nn.Module):
 class AnchorModel(Anchors):
     """N static anchors with K children each; parameters in scene units."""
 
-    def __init__(self, n: int, variant: Variant) -> None:
+    def __init__(self, n: int, variant: StaticAnchorSpec) -> None:
         super().__init__(n, variant.children, 3)
         self.variant = variant
         self.opacity_head = head(FEATURES + 3, variant.children)
@@ -87,7 +87,7 @@ class AnchorModel(Anchors):
         self.color_head = head(FEATURES + 3, 3 * variant.children)
 
     @classmethod
-    def from_seed(cls, seed: AnchorSeed, variant: Variant) -> AnchorModel:
+    def from_seed(cls, seed: AnchorSeed, variant: StaticAnchorSpec) -> AnchorModel:
         """A model about to be fitted; random numbers come from torch's generator."""
         model = cls(len(seed.positions), variant)
         spacing = torch.as_tensor(seed.spacing)
@@ -117,7 +117,7 @@ class AnchorModel(Anchors):
             return seen, seen
         return seen, torch.cat([self.features, torch.zeros_like(direction)], dim=1)
 
-    def decode(self, eye: NDArray) -> Gaussians:
+    def decode(self, eye: NDArray) -> DecodedGaussians:
         """The Gaussians as seen from `eye` [3]."""
         rows = len(self) * self.variant.children
         seen, blind = self._inputs(eye)
@@ -129,7 +129,7 @@ class AnchorModel(Anchors):
         if self.variant.base_color:
             logits = logits + self.features[:, None, :3]
         means = self.positions[:, None] + self.offsets * torch.exp(self.log_scales[:, None, :3])
-        return Gaussians(means.view(rows, 3), factors, opacity, torch.sigmoid(logits).view(rows, 3), scales)
+        return DecodedGaussians(means.view(rows, 3), factors, opacity, torch.sigmoid(logits).view(rows, 3), scales)
 
 
 def random_offsets(n: int, children: int, dimensions: int = 3) -> torch.Tensor:

@@ -9,27 +9,27 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splashbench.gaussians.optimizer import Rate, RowOptimizer
+from splashbench.gaussians.optimizer import LearningRate, RowOptimizer
 
 from .model import PER_ANCHOR, Anchors
 
 # "published" are those of Scaffold-GS.
-RATES: dict[str, dict[str, Rate]] = {
+RATES: dict[str, dict[str, LearningRate]] = {
     "published": {
-        "offsets": Rate(0.01, 0.0001),
-        "features": Rate.constant(0.0075),
-        "log_scales": Rate.constant(0.007),
-        "opacity_head": Rate(0.002, 0.00002),
-        "shape_head": Rate.constant(0.004),
-        "color_head": Rate(0.008, 0.00005),
+        "offsets": LearningRate(0.01, 0.0001),
+        "features": LearningRate.constant(0.0075),
+        "log_scales": LearningRate.constant(0.007),
+        "opacity_head": LearningRate(0.002, 0.00002),
+        "shape_head": LearningRate.constant(0.004),
+        "color_head": LearningRate(0.008, 0.00005),
     },
     "short": {
-        "offsets": Rate(0.01, 0.001),
-        "features": Rate(0.02, 0.002),
-        "log_scales": Rate(0.01, 0.001),
-        "opacity_head": Rate(0.002, 0.0002),
-        "shape_head": Rate(0.004, 0.0004),
-        "color_head": Rate(0.008, 0.0008),
+        "offsets": LearningRate(0.01, 0.001),
+        "features": LearningRate(0.02, 0.002),
+        "log_scales": LearningRate(0.01, 0.001),
+        "opacity_head": LearningRate(0.002, 0.0002),
+        "shape_head": LearningRate(0.004, 0.0004),
+        "color_head": LearningRate(0.008, 0.0008),
     },
 }
 
@@ -40,7 +40,7 @@ class AnchorOptimizer(RowOptimizer):
     model: Anchors
 
     def __init__(
-        self, model: Anchors, rates: Literal["short", "published"] | Mapping[str, Rate], iterations: int
+        self, model: Anchors, rates: Literal["short", "published"] | Mapping[str, LearningRate], iterations: int
     ) -> None:
         super().__init__(model, RATES[rates] if isinstance(rates, str) else rates, PER_ANCHOR, iterations)
 

@@ -23,7 +23,7 @@ class BackgroundSettings(MethodConfig):
         start: where the anchors start: "pixels" lifts every training pixel to its depth (plane sweep), "points" takes
             the scene's sparse points, one anchor per voxel.
         iterations: optimisation steps, one training view each.
-        anchors: at most this many anchors, grown ones included.
+        max_anchors: at most this many anchors, grown ones included.
         children: Gaussians per anchor, k of Scaffold-GS.
         longest_side: images are shrunk to this many pixels for fitting; rendering is at any size.
         coarse_side: the fit begins on images of at most this many pixels and doubles them until they are whole.
@@ -39,20 +39,21 @@ class BackgroundSettings(MethodConfig):
         prune_opacity: anchors whose children's mean opacities add up to less are dropped.
     """
 
+    renamed: ClassVar[Mapping[str, str]] = {"anchors": "max_anchors"}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "best": {},
         "paper": {
-            "frames": "first", "start": "points", "iterations": 20_000, "anchors": 100_000, "children": 10,
+            "frames": "first", "start": "points", "iterations": 20_000, "max_anchors": 100_000, "children": 10,
             "longest_side": 16384, "coarse_side": 16384, "ssim_every": 1, "view_dependent_shape": True,
             "base_color": False, "rates": "published", "grow_from": 0.075, "grow_until": 0.5,
         },
-        "quick": {"iterations": 400, "anchors": 5_000, "longest_side": 400},
+        "quick": {"iterations": 400, "max_anchors": 5_000, "longest_side": 400},
     }  # fmt: skip
 
     frames: Literal["all", "first"] = "all"
     start: Literal["pixels", "points"] = "pixels"
     iterations: int = Field(default=1500, ge=1, le=1_000_000)
-    anchors: int = Field(default=15_000, ge=10, le=5_000_000)
+    max_anchors: int = Field(default=15_000, ge=10, le=5_000_000)
     children: int = Field(default=2, ge=1, le=32)
     longest_side: int = Field(default=800, ge=16, le=16384)
     coarse_side: int = Field(default=400, ge=16, le=16384)

@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splashbench.gaussians.density import DensityControl
-from splashbench.gaussians.photographs import Photograph, Photographs
-from splashbench.gaussians.splats import Splats
+from splashbench.gaussians.density_control import DensityControl
+from splashbench.gaussians.dynamic_model import Splats
+from splashbench.gaussians.photographs import Photographs, TrainingPhotograph
 from splashbench.scene import Camera
 
 from .model import SpacetimeModel, rays
-from .settings import Settings
+from .settings import SpacetimeSettings
 
 PATCH = 8
 PER_RAY = 4
@@ -41,7 +41,7 @@ class GuidedDensity:
         density: DensityControl,
         model: SpacetimeModel,
         photographs: Photographs,
-        config: Settings,
+        config: SpacetimeSettings,
         rng: np.random.Generator,
     ) -> None:
         self._density, self._model, self._photographs = density, model, photographs
@@ -57,17 +57,17 @@ class GuidedDensity:
     def after_step(self, step: int) -> None:
         self._density.after_step(step)
         if self._from <= step < self._until and (step - self._from) % self._config.guided_every == 0:
-            room = self._config.most - len(self._model.positions)
+            room = self._config.max_gaussians - len(self._model.positions)
             patches = min(self._config.guided_patches, room // PER_RAY)
             if patches > 0:
                 photograph, error, depths = self._worst()
                 self._density.append(self._gaussians(photograph, error, depths, patches))
 
     @torch.no_grad()
-    def _worst(self) -> tuple[Photograph, NDArray[np.float32], NDArray[np.float32]]:
+    def _worst(self) -> tuple[TrainingPhotograph, NDArray[np.float32], NDArray[np.float32]]:
         """The photograph that is matched worst, its error per pixel [H, W], and the depths of what it shows [M]."""
         looked_at = self._photographs.some(_LOOKED_AT)
-        best: tuple[float, Photograph, NDArray[np.float32], NDArray[np.float32]] | None = None
+        best: tuple[float, TrainingPhotograph, NDArray[np.float32], NDArray[np.float32]] | None = None
         for photograph in looked_at:
             camera = photograph.camera
             splats = self._model.splats(self._model.at(photograph.time), camera)
@@ -82,7 +82,7 @@ class GuidedDensity:
         return best[1], best[2], best[3]
 
     def _gaussians(
-        self, photograph: Photograph, error: NDArray[np.float32], depths: NDArray[np.float32], patches: int
+        self, photograph: TrainingPhotograph, error: NDArray[np.float32], depths: NDArray[np.float32], patches: int
     ) -> dict[str, Tensor]:
         """Rows of all tables for Gaussians along the rays of the worst patches; none where the view shows nothing."""
         placed = along_worst_rays(photograph, error, depths, patches, self._rng)
@@ -110,7 +110,7 @@ class Placed(NamedTuple):
 
 
 def along_worst_rays(
-    photograph: Photograph,
+    photograph: TrainingPhotograph,
     error: NDArray[np.float32],
     depths: NDArray[np.float32],
     patches: int,

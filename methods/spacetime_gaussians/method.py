@@ -9,40 +9,40 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.density_control import DensityControl
 from splashbench.gaussians.fitting import fit_dynamic
-from splashbench.gaussians.mixed import MODEL_FILE, MixedFitted, load_tables
-from splashbench.gaussians.optimizer import Rate, RowOptimizer
+from splashbench.gaussians.initialization import camera_extent, initialization
+from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
+from splashbench.gaussians.optimizer import LearningRate, RowOptimizer
 from splashbench.gaussians.photographs import Photographs, unit_time
-from splashbench.gaussians.start import camera_extent, started
 from splashbench.harness.contract import Method, MethodConfig, Run
 from splashbench.scene import TrainingScene
 
 from .guided import GuidedDensity
 from .model import SpacetimeModel
-from .settings import Settings
+from .settings import SpacetimeSettings
 
 
-def rates(settings: Settings, extent: float, full: bool) -> dict[str, Rate]:
+def rates(settings: SpacetimeSettings, extent: float, full: bool) -> dict[str, LearningRate]:
     """Learning rates by table; `extent` of the cameras, scene units."""
     factor, color = settings.rate_factor, settings.color_factor
     position, motion = 1.6e-4 * extent * factor, 2.8e-4 * extent * factor
     published = {
-        "positions": Rate(position, position / 100),
-        "motions": Rate.constant(motion),
-        "log_scales": Rate.constant(5e-3),
-        "quaternions": Rate.constant(1e-3),
-        "spins": Rate.constant(1e-4),
-        "opacity_logits": Rate.constant(0.05),
-        "times": Rate.constant(1e-4),
-        "log_widths": Rate.constant(0.03),
-        "base": Rate.constant(2.5e-3 * color),
+        "positions": LearningRate(position, position / 100),
+        "motions": LearningRate.constant(motion),
+        "log_scales": LearningRate.constant(5e-3),
+        "quaternions": LearningRate.constant(1e-3),
+        "spins": LearningRate.constant(1e-4),
+        "opacity_logits": LearningRate.constant(0.05),
+        "times": LearningRate.constant(1e-4),
+        "log_widths": LearningRate.constant(0.03),
+        "base": LearningRate.constant(2.5e-3 * color),
     }
     if full:
         published |= {
-            "features": Rate.constant(2.5e-3 * color),
-            "time_features": Rate.constant(1e-3 * color),
-            "decoder": Rate.constant(1e-4 * color),
+            "features": LearningRate.constant(2.5e-3 * color),
+            "time_features": LearningRate.constant(1e-3 * color),
+            "decoder": LearningRate.constant(1e-4 * color),
         }
     if settings.rates == "published":
         return published
@@ -55,12 +55,12 @@ class SpacetimeGaussians(Method):
     id: ClassVar[str] = "spacetime_gaussians"
     title: ClassVar[str] = "SpacetimeGaussians, full"
     version: ClassVar[str] = "3"  # since `quick` starts with faint Gaussians, as published
-    Config: ClassVar[type[MethodConfig]] = Settings
+    Config: ClassVar[type[MethodConfig]] = SpacetimeSettings
     mixed: ClassVar[bool] = True
     full: ClassVar[bool] = True
 
-    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> MixedFitted:
-        with started(scene, config, run) as (start, rng):
+    def fit(self, scene: TrainingScene, config: SpacetimeSettings, run: Run) -> MixedFitted:
+        with initialization(scene, config, run) as (start, rng):
             times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
             model = SpacetimeModel.from_start(start, self.full, config.start_opacity, config.hull_log_width, times)
             extent = camera_extent(scene)

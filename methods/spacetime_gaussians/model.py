@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from splashbench.gaussians.splats import DynamicModel, Splats, rotation_matrices
-from splashbench.gaussians.start import Start
+from splashbench.gaussians.dynamic_model import DynamicModel, Splats, rotation_matrices
+from splashbench.gaussians.initialization import StartingPoints
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
 
@@ -28,7 +28,7 @@ LITE_ROWS = (
 FULL_ROWS = (*LITE_ROWS, "features", "time_features")
 
 
-class State(NamedTuple):
+class VisibleGaussians(NamedTuple):
     """The n Gaussians that show at an instant: rows [n], which; means [n, 3], factors [n, 3, 3], opacities [n],
     channels [n, C]."""
 
@@ -66,7 +66,7 @@ class SpacetimeModel(DynamicModel):
 
     @classmethod
     def from_start(
-        cls, start: Start, full: bool, opacity: float, log_width: float, times: np.ndarray
+        cls, start: StartingPoints, full: bool, opacity: float, log_width: float, times: np.ndarray
     ) -> SpacetimeModel:
         """A model about to be fitted; times: [frames] in [0, 1]. Static points last all the recording long."""
         model = cls(len(start), full)
@@ -92,7 +92,7 @@ class SpacetimeModel(DynamicModel):
             # With a margin: what is left out is fainter than what the renderer leaves out. What is no number stays.
             return torch.nonzero(~(opacities < 0.9 * MIN_ALPHA))[:, 0]
 
-    def at(self, time: float) -> State:
+    def at(self, time: float) -> VisibleGaussians:
         shown = self._shown(time)
         table = {name: self.get_parameter(name).index_select(0, shown) for name in self.rows}
         since = time - table["times"]
@@ -101,7 +101,7 @@ class SpacetimeModel(DynamicModel):
         channels = [table["base"]]
         if self.full:
             channels += [table["features"], table["time_features"] * cut]
-        return State(
+        return VisibleGaussians(
             rows=shown,
             means=_moved(table["positions"], table["motions"], cut),
             factors=factors * torch.exp(table["log_scales"])[:, None],
@@ -112,7 +112,7 @@ class SpacetimeModel(DynamicModel):
     def means(self, time: float) -> Tensor:
         return _moved(self.positions, self.motions, (time - self.times.detach())[:, None])
 
-    def splats(self, state: State, camera: Camera) -> Splats:
+    def splats(self, state: VisibleGaussians, camera: Camera) -> Splats:
         return Splats(state.means, state.factors, state.opacities, state.channels, rows=state.rows)
 
     def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:

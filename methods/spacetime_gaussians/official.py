@@ -22,15 +22,10 @@ from torch import Tensor, nn
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
-from splashbench.gaussians.mixed import MODEL_FILE, load_tables
+from splashbench.gaussians.mixed_model import MODEL_FILE, load_tables
 from splashbench.gaussians.official.checkpoint import fill, read_weights
-from splashbench.gaussians.official.importer import (
-    Arguments,
-    OfficialFitted,
-    OfficialModel,
-    last_point_cloud,
-    require_finite,
-)
+from splashbench.gaussians.official.model import OfficialFitted, OfficialModel, require_finite
+from splashbench.gaussians.official.output_folder import TrainingArguments, last_point_cloud
 from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
 from splashbench.harness.external.importers import Importer
 from splashbench.scene import Camera, TrainingScene
@@ -89,7 +84,7 @@ class OfficialSpacetimeGaussians(Importer):
     mixed: ClassVar[bool] = True
 
     def read(self, output: Path, export: Path, scene: TrainingScene) -> OfficialFitted:
-        path, arguments = last_point_cloud(output), Arguments.read(output)
+        path, arguments = last_point_cloud(output), TrainingArguments.read(output)
         model = _gaussians(read_point_cloud(path))
         duration, loader = arguments.number("duration"), arguments.text("loader")
         if duration < 1:

@@ -10,7 +10,7 @@ from pydantic import Field
 from splashbench.gaussians.settings import SplattingSettings
 
 
-class Settings(SplattingSettings):
+class SpacetimeSettings(SplattingSettings):
     """How Gaussians with a time of their own are fitted; besides what all baselines share:
 
     Attributes:
@@ -22,13 +22,13 @@ class Settings(SplattingSettings):
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
-            "iterations": 6000, "views_per_step": 1, "hull_points": 40_000, "most": 60_000, "rate_factor": 1.5,
+            "iterations": 6000, "views_per_step": 1, "hull_points": 40_000, "max_gaussians": 60_000, "rate_factor": 1.5,
             "color_factor": 2.0, "new_times": "kept", "start_opacity": 0.1,
         },
         "paper": {
             "iterations": 30_000, "views_per_step": 2, "static": "points", "static_points": 100_000,
-            "hull_points": 200_000, "start_opacity": 0.1, "most": 1_000_000, "grow_from": 0.02, "grow_until": 0.06,
-            "prune_until": 0.2333, "reset_every": 3000, "reset_until": 0.3, "rates": "published",
+            "hull_points": 200_000, "start_opacity": 0.1, "max_gaussians": 1_000_000, "grow_from": 0.02,
+            "grow_until": 0.06, "prune_until": 0.2333, "reset_every": 3000, "reset_until": 0.3, "rates": "published",
             "longest_side": 16384, "guided_from": 0.0533, "guided_until": 0.1, "hull_log_width": -2.0,
         },
     }  # fmt: skip

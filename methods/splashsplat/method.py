@@ -18,7 +18,7 @@ from splashbench.scene.scene import TrainingScene
 
 from .appearance.decoder import Children
 from .appearance.fitting import composite
-from .appearance.occlusion import Occlusion
+from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
 from .reconstruction import fit_liquid
 from .settings import VERSION, SplashSplatConfig
@@ -34,7 +34,7 @@ _BACKGROUND = 0.25
 class FittedSplashSplat(Fitted):
     """Liquid over a frozen background: in front of it, but for what the container hides."""
 
-    def __init__(self, liquid: Liquid, background: Background, occlusion: Occlusion | None = None) -> None:
+    def __init__(self, liquid: Liquid, background: Background, occlusion: LiquidOcclusion | None = None) -> None:
         self.liquid = liquid
         self.background = background
         self.occlusion = occlusion
@@ -122,4 +122,4 @@ class SplashSplat(Method):
         from ..scaffold_gs import Background
 
         static = directory / "static"
-        return FittedSplashSplat(Liquid.load(directory), Background.load(static), Occlusion.load(static))
+        return FittedSplashSplat(Liquid.load(directory), Background.load(static), LiquidOcclusion.load(static))

@@ -19,9 +19,10 @@ from splashbench.scene.particles import Particles
 
 from .appearance.decoder import Decoder, DecoderSettings
 from .appearance.fitting import Appearance
-from .carriers.tracking import Carriers
-from .motion.step import Motion, falls_of
-from .subframe import Track
+from .carriers.population import Carriers
+from .carriers.subframe import Track
+from .motion.fall import falls_of, table_of
+from .motion.steps import Motion
 
 FORMAT = 3
 
@@ -43,20 +44,12 @@ def store_precision(carriers: Carriers, grid: Grid) -> Carriers:
     )
 
 
-def pack_phi(phi: np.ndarray) -> np.ndarray:
-    """Signed distance in voxels to int8.
-
-    phi is needed between frames only and matters within a few voxels of the interface: 1/16 voxel, up to +-7.9 voxels.
-    """
-    return SignedDistance.of(phi[None], np.zeros(3), 1.0).phi[0]
-
-
 @dataclass
 class Liquid:
     """The dynamic foreground.
 
     times: [T] seconds. grid: the transport grid. carriers, motion: in the precision of the files. phi: int8 [T, nx, ny,
-    nz], see `pack_phi`. carried: whether the motion is what moved the carriers.
+    nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers.
     """
 
     times: np.ndarray
@@ -140,7 +133,7 @@ class Liquid:
             deformation=carriers.deformation.astype(np.float16),
             phi=carriers.phi.astype(np.float16),
         )
-        jets, turn = self.motion.table()
+        jets, turn = table_of(self.motion.falls)
         np.savez_compressed(directory / "velocity.npz", velocities=self.motion.velocities, jets=jets, turn=turn)
         np.savez_compressed(directory / "phi.npz", phi=self.phi)
         heads = {f"heads.{name}": value.numpy() for name, value in self.appearance.decoder.state_dict().items()}
@@ -165,7 +158,9 @@ class Liquid:
             times = np.array(header["times"], dtype=np.float64)
             factor, count = int(header["factor"]), int(header["carriers"])
             carried = bool(header["carried"])
-            decoder = Decoder(DecoderSettings(**header["decoder"]))
+            decoder = Decoder(
+                DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})
+            )
         except (KeyError, TypeError, ValueError) as error:
             raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); fit the scene again") from None
         ranks = {"starts": 1, "ids": 1, "positions": 2, "deformation": 3, "phi": 1}
@@ -187,10 +182,13 @@ class Liquid:
             ) from None
         motion = Motion(moves["velocities"], factor, falls)
         phi = read_npz(directory / "phi.npz", {"phi": 4})["phi"]
-        shapes = {f"heads.{name}": value.ndim for name, value in decoder.state_dict().items()}
+        # Models of version 0.1 spell the heads "colour".
+        british = "colour_width" in header["decoder"]
+        heads = {name: f"heads.{name.replace('color', 'colour') if british else name}" for name in decoder.state_dict()}
+        shapes = {heads[name]: value.ndim for name, value in decoder.state_dict().items()}
         tables = read_npz(directory / "appearance.npz", {"features": 2, "log_scales": 2, **shapes})
         try:
-            decoder.load_state_dict({name: torch.from_numpy(tables[f"heads.{name}"]) for name in decoder.state_dict()})
+            decoder.load_state_dict({name: torch.from_numpy(tables[stored]) for name, stored in heads.items()})
         except RuntimeError:
             raise SplashbenchError(
                 f"{directory / 'appearance.npz'} does not fit liquid.json; fit the scene again"

@@ -1,4 +1,8 @@
-"""From masks to the fitted liquid: observation fields, motion, carriers, appearance (paper, Fig. "pipeline")."""
+"""From masks to the fitted liquid: observation fields, motion, carriers, appearance (paper, Fig. "pipeline").
+
+Each name stands for a folder: `fields` observes the whole sequence, `motion` gives one observed frame after another
+with what moved the liquid there, `carriers` follow frame by frame, and `appearance` is fitted to the photographs.
+"""
 
 from __future__ import annotations
 
@@ -13,50 +17,26 @@ from splashbench.observe.container import solid_distance
 from splashbench.scene.scene import TrainingScene
 
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
-from .appearance.occlusion import Occlusion
 from .appearance.targets import collect_targets
-from .carriers.tracking import Carriers, Simulation, track_carriers
-from .fields.observations import Observations
+from .carriers.population import Carriers
+from .carriers.subframe import Track
+from .carriers.tracking import CarrierTracker, Simulation, Tracking
+from .carriers.visibility import seen_by_any
+from .fields.observations import Observations, observe
+from .fields.occlusion import LiquidOcclusion
 from .flip.solver import FlipSolver, FlipTransport, gravity_in_voxels
 from .model import Liquid, store_precision
-from .motion.step import Motion
+from .motion.observed_frames import observed_frames
+from .motion.steps import FrameStep, Motion
+from .motion.velocity import control_shape
 from .settings import SplashSplatConfig
-from .subframe import Track
 
 Report = Callable[[float, str], None]
 
 # Share of the time that everything before the appearance takes, for the progress bar only.
 _TRACKING = 0.25
-
-
-@dataclass(frozen=True)
-class _Steps:
-    """FLIP by the scene's frame steps."""
-
-    transport: FlipTransport
-    durations: np.ndarray
-    motion: Motion
-
-    def forecast(self, ids: np.ndarray, deformation: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-        return self.transport.forecast(ids, deformation, float(self.durations[step]), self.motion.step(step))
-
-
-def _simulation(
-    observations: Observations, scene: TrainingScene, seed: int
-) -> Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]:
-    """Starts FLIP from the first carriers. Raises SplashbenchError where it is not known how things fall."""
-    grid, motion = observations.grid, observations.motion
-    gravity = gravity_in_voxels(scene, grid)
-    mesh = scene.container_mesh()
-    solid = None if mesh is None else solid_distance(mesh, grid)
-
-    def start(phi: np.ndarray, ids: np.ndarray, positions: np.ndarray) -> Simulation:
-        solver = FlipSolver(grid.shape, gravity, solid)
-        ratio = grid.voxel / observations.hull_grid.voxel
-        transport = FlipTransport(solver, phi, ratio, ids, positions, np.random.default_rng([seed, 2]))
-        return _Steps(transport, np.diff(scene.times), motion)
-
-    return start
+# A carrier is seen through at most this many shells of liquid.
+_SEEN_THROUGH = 1.5
 
 
 def fit_liquid(
@@ -65,7 +45,7 @@ def fit_liquid(
     config: SplashSplatConfig,
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
-) -> tuple[Liquid, Occlusion | None]:
+) -> tuple[Liquid, LiquidOcclusion | None]:
     """Reconstruct the liquid of `scene`; and what hides it from cameras.
 
     backgrounds: float32 [H, W, 3] of every training view, in [0, 1]. span: the part of `run`'s progress this takes up.
@@ -74,49 +54,124 @@ def fit_liquid(
     def report(fraction: float, message: str) -> None:
         run.progress(span[0] + (span[1] - span[0]) * fraction, message)
 
-    observations = Observations(scene, config, run, lambda done, message: report(_TRACKING * done, message))
-    grid, motion, occlusion = observations.grid, observations.motion, observations.occlusion
-    carriers = track_carriers(
-        observations,
-        observations.hull_grid,
-        grid,
-        motion,
-        config.carriers,
-        run.seed,
-        observations.seen if config.visible_only else None,
-        observations.landed if config.ballistic else None,
-        _simulation(observations, scene, run.seed) if config.variant == "flip" else None,
-    )
-    carriers = store_precision(carriers, grid)
+    def report_tracking(fraction: float, message: str) -> None:
+        report(_TRACKING * fraction, message)
+
+    observations = observe(scene, config.fields, run, report_tracking)
+    carriers, motion, packed = _track(observations, scene, config, run, report_tracking)
+    carriers = store_precision(carriers, observations.grid)
     with run.stage("appearance"), one_torch_thread():
-        appearance = initial_appearance(carriers.count, grid.voxel, config.optimisation, config.decoder, run.seed)
-        track = Track(grid, carriers, motion, observations.packed)
-        targets = collect_targets(
+        track = Track(observations.grid, carriers, motion, packed)
+        appearance = _fit_appearance(
+            track,
+            observations,
             scene,
             backgrounds,
-            track,
-            config.silhouette_norm,
-            camera_times=config.camera_times,
-            trusted=~observations.silhouettes.failed_masks,
-            hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
+            config,
+            run.seed,
+            lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
         )
-        if targets:
-            fit_appearance(
-                appearance,
-                track,
-                targets,
-                config.optimisation,
-                observations.hull_grid.voxel / grid.voxel,
-                run.seed,
-                lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
-            )
         carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
     # What moves the carriers of the other variants is not u_t.
     carried = config.variant in ("full", "no_resampling")
-    return Liquid.of(scene.times, grid, carriers, motion, observations.packed, appearance, carried), occlusion
+    liquid = Liquid.of(scene.times, observations.grid, carriers, motion, packed, appearance, carried)
+    return liquid, observations.occlusion
+
+
+def _track(
+    observations: Observations, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report
+) -> tuple[Carriers, Motion, np.ndarray]:
+    """Carriers through all frames, what moved them, and the packed phi_t: int8 [T, nx, ny, nz], transport grid."""
+    grid, settings = observations.grid, config.motion
+    tracker = CarrierTracker(_tracking(observations, scene, config, run.seed))
+    steps: list[FrameStep] = []
+    packed = np.zeros((observations.n_frames, *grid.shape), dtype=np.int8)
+    for t, frame in enumerate(observed_frames(observations, scene, settings, run, report)):
+        packed[t] = frame.packed
+        if frame.step is not None:
+            steps.append(frame.step)
+        with run.stage("carriers"):
+            tracker.advance(frame.phi, frame.step)
+    factor = settings.control_factor
+    return tracker.carriers(), Motion.of(steps, control_shape(grid.shape, factor), factor), packed
+
+
+def _tracking(observations: Observations, scene: TrainingScene, config: SplashSplatConfig, seed: int) -> Tracking:
+    def seen(phi: np.ndarray, points: np.ndarray) -> np.ndarray:
+        cameras, depths = observations.silhouettes.cameras, observations.container_depths
+        limit = _SEEN_THROUGH * config.shell_depth * observations.ratio
+        return seen_by_any(phi, observations.hull_grid, points, cameras, depths, limit, observations.ratio)
+
+    return Tracking(
+        observations.hull_grid,
+        observations.grid,
+        config.carriers,
+        seed,
+        seen=seen if config.visible_only else None,
+        landed=observations.landed if config.ballistic else None,
+        simulation=_simulation(observations, scene, seed) if config.variant == "flip" else None,
+    )
+
+
+@dataclass(frozen=True)
+class _TimedFlip:
+    """FLIP by the scene's frame steps; durations: [T - 1] seconds."""
+
+    transport: FlipTransport
+    durations: np.ndarray
+
+    def forecast(
+        self, ids: np.ndarray, deformation: np.ndarray, number: int, observed: FrameStep
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return self.transport.forecast(ids, deformation, float(self.durations[number]), observed)
+
+
+def _simulation(
+    observations: Observations, scene: TrainingScene, seed: int
+) -> Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]:
+    """Starts FLIP from the first carriers. Raises SplashbenchError where it is not known how things fall."""
+    grid = observations.grid
+    gravity = gravity_in_voxels(scene, grid)
+    mesh = scene.container_mesh()
+    solid = None if mesh is None else solid_distance(mesh, grid)
+
+    def start(phi: np.ndarray, ids: np.ndarray, positions: np.ndarray) -> Simulation:
+        solver = FlipSolver(grid.shape, gravity, solid)
+        rng = np.random.default_rng([seed, 2])
+        transport = FlipTransport(solver, phi, observations.ratio, ids, positions, rng)
+        return _TimedFlip(transport, np.diff(scene.times))
+
+    return start
+
+
+def _fit_appearance(
+    track: Track,
+    observations: Observations,
+    scene: TrainingScene,
+    backgrounds: dict[str, np.ndarray],
+    config: SplashSplatConfig,
+    seed: int,
+    progress: Callable[[float], None],
+) -> Appearance:
+    """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail."""
+    occlusion, voxel = observations.occlusion, observations.grid.voxel
+    appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
+    targets = collect_targets(
+        scene,
+        backgrounds,
+        track,
+        config.silhouette_norm,
+        camera_times=config.camera_times,
+        trusted=~observations.silhouettes.failed_masks,
+        hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
+    )
+    if targets:
+        color_cell = observations.hull_grid.voxel / voxel
+        fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress)
+    return appearance
 
 
 def _pruned(carriers: Carriers, appearance: Appearance, threshold: float) -> tuple[Carriers, Appearance]:
     """Without the carriers that the images made transparent: the phantom volume of the hull."""
-    carriers, kept = carriers.keep(visible_carriers(appearance, threshold))
-    return carriers, Appearance(appearance.features[kept], appearance.log_scales[kept], appearance.decoder)
+    carriers, rows = carriers.keep(visible_carriers(appearance, threshold))
+    return carriers, Appearance(appearance.features[rows], appearance.log_scales[rows], appearance.decoder)

@@ -18,7 +18,9 @@ from .appearance.decoder import DecoderSettings
 from .appearance.fitting import FitSettings
 from .appearance.losses import LossWeights
 from .carriers.resampling import ShellSettings
-from .carriers.tracking import CarrierSettings, Variant
+from .carriers.tracking import CarrierSettings, TrackingVariant
+from .fields.observations import FieldSettings
+from .motion.observed_frames import MotionSettings
 from .motion.velocity import VelocitySettings
 
 if TYPE_CHECKING:
@@ -36,11 +38,12 @@ class SplashSplatConfig(MethodConfig):
     hull_cells: int = Field(224, ge=16, le=512)
     transport_cells: int = Field(112, ge=16, le=256)
     control_cells: int = Field(28, ge=4, le=128)
-    distance: DistanceMethod = "silhouette"
+    #: how phi_t is computed: straight from the "silhouette", or by "carve" as in the paper
+    signed_distance: DistanceMethod = "silhouette"
     #: use the container's mesh, where the scene has one: what it hides, and where its walls are
     container: bool = True
-    #: tell masks with much missing, beside empty ones
-    detect_failures: bool = True
+    #: leave out masks that miss much of the liquid, as well as empty ones
+    detect_failed_masks: bool = True
     #: carve, and compare photographs, at each camera's own times, where the scene has them
     camera_times: bool = True
     #: level the liquid that rests in the container (needs the mesh and gravity)
@@ -58,7 +61,7 @@ class SplashSplatConfig(MethodConfig):
     projection_blend: float = Field(0.35, ge=0, le=1)
     velocity_limit: PositiveFloat = 8.0
     # Carriers
-    variant: Variant = "full"
+    variant: TrackingVariant = "full"
     correction: PositiveFloat = 1.0
     kill_outside: PositiveFloat = 0.5
     kill_inside: float | None = Field(-3.0, lt=0)
@@ -80,14 +83,14 @@ class SplashSplatConfig(MethodConfig):
     # Optimisation
     iterations: int = Field(4000, ge=0)
     learning_rate_features: PositiveFloat = 0.06
-    learning_rate_shared: PositiveFloat = 0.02
+    learning_rate_cells: PositiveFloat = 0.02
     learning_rate_heads: PositiveFloat = 0.015
     learning_rate_scales: PositiveFloat = 1e-2
     #: carriers born in one cell share a part of their features: its size in voxels and in frames, for each part
-    shared_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
+    feature_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
     anneal: bool = True
-    #: of the photographs, withheld to tell when to stop before `iterations`; 0 never stops before
-    withheld_share: float = Field(0.04, ge=0, le=0.1)
+    #: share of the photographs by whose loss the fit stops before `iterations`, and which it leaves out; 0 never stops
+    validation_share: float = Field(0.04, ge=0, le=0.1)
     stop_gain: float = Field(0.01, ge=0, lt=1)
     ssim_every: PositiveInt = 1
     silhouette_norm: Literal["image", "mask"] = "image"
@@ -97,21 +100,29 @@ class SplashSplatConfig(MethodConfig):
     silhouette_weight: float = Field(0.7, ge=0)
     covariance_weight: float = Field(0.01, ge=0)
     separation_weight: float = Field(0.1, ge=0)
-    colour_weight: float = Field(1.0, ge=0)
+    color_weight: float = Field(1.0, ge=0)
     #: carriers whose learned opacity ends below this are dropped; 0 keeps all
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
 
+    renamed: ClassVar[Mapping[str, str]] = {
+        "distance": "signed_distance",
+        "detect_failures": "detect_failed_masks",
+        "learning_rate_shared": "learning_rate_cells",
+        "shared_cells": "feature_cells",
+        "withheld_share": "validation_share",
+        "colour_weight": "color_weight",
+    }
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "best": {},
         "paper": {
             "hull_cells": 176,
             "transport_cells": 96,
             "control_cells": 24,
-            "distance": "carve",
+            "signed_distance": "carve",
             "container": False,
-            "detect_failures": False,
+            "detect_failed_masks": False,
             "camera_times": False,
             "pool": False,
             "ballistic": False,
@@ -129,9 +140,9 @@ class SplashSplatConfig(MethodConfig):
             "learning_rate_features": 2e-3,
             "learning_rate_heads": 2e-3,
             "learning_rate_scales": 2e-3,
-            "shared_cells": (),
+            "feature_cells": (),
             "anneal": False,
-            "withheld_share": 0.0,
+            "validation_share": 0.0,
             "prune_opacity": 0.0,
             "background_preset": "paper",
         },
@@ -161,8 +172,21 @@ class SplashSplatConfig(MethodConfig):
         return BackgroundSettings.model_validate(BackgroundSettings.presets[self.background_preset])
 
     @property
-    def velocity(self) -> VelocitySettings:
-        return VelocitySettings(
+    def fields(self) -> FieldSettings:
+        return FieldSettings(
+            hull_cells=self.hull_cells,
+            transport_cells=self.transport_cells,
+            signed_distance=self.signed_distance,
+            container=self.container,
+            detect_failed_masks=self.detect_failed_masks,
+            camera_times=self.camera_times,
+            pool=self.pool,
+            ballistic=self.ballistic,
+        )
+
+    @property
+    def motion(self) -> MotionSettings:
+        velocity = VelocitySettings(
             steps=self.velocity_steps,
             step_size=self.velocity_step_size,
             band=self.velocity_band,
@@ -171,6 +195,7 @@ class SplashSplatConfig(MethodConfig):
             projection_blend=self.projection_blend,
             limit=self.velocity_limit,
         )
+        return MotionSettings(self.control_factor, self.gate_motion, self.variant != "per_frame", velocity)
 
     @property
     def carriers(self) -> CarrierSettings:
@@ -198,12 +223,12 @@ class SplashSplatConfig(MethodConfig):
         return FitSettings(
             iterations=self.iterations,
             learning_rate_features=self.learning_rate_features,
-            learning_rate_shared=self.learning_rate_shared,
-            shared_cells=self.shared_cells,
+            learning_rate_cells=self.learning_rate_cells,
+            feature_cells=self.feature_cells,
             learning_rate_heads=self.learning_rate_heads,
             learning_rate_scales=self.learning_rate_scales,
             anneal=self.anneal,
-            withheld_share=self.withheld_share,
+            validation_share=self.validation_share,
             stop_gain=self.stop_gain,
             ssim_every=self.ssim_every,
             base_scale=self.base_scale,
@@ -214,6 +239,6 @@ class SplashSplatConfig(MethodConfig):
                 silhouette=self.silhouette_weight,
                 covariance=self.covariance_weight,
                 separation=self.separation_weight,
-                colour=self.colour_weight,
+                color=self.color_weight,
             ),
         )

@@ -1,2 +1,1 @@
-"""What stands still: every training view without its liquid (plate.py), and how deep its pixels lie (sweep.py view by
-view, depth.py across views). Needs no torch."""
+"""The static background: each training view's clean plate (its image without liquid), and the depth of its pixels."""

@@ -1,8 +1,9 @@
-"""The liquid-free plate: what a training view shows when no liquid is in front of it.
+"""The clean plate of a training view: its image without the liquid.
 
+"Clean plate" is the word of film crews for a shot of the empty set; "plate" is short for it throughout.
 The paper fits its background to frame 0. Liquid already in that frame would be baked in, or, masked, leave the pixels
-under it without evidence. The median over the frames in which a pixel is free of liquid uses more of the recording;
-pixels that are never free are marked.
+under it without evidence. A clean plate is the median over the frames in which a pixel is free of liquid, which uses
+more of the recording. Pixels that are never free are marked.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _BAND_ROWS = 128
 
 
 @dataclass(frozen=True)
-class Plate:
+class CleanPlate:
     """One view without its liquid.
 
     Attributes:
@@ -42,7 +43,7 @@ class Plate:
         return np.asarray(self.image * np.float32(1 / 255))
 
 
-def make_plate(scene: TrainingScene, name: str, longest_side: int, n_frames: int = MAX_FRAMES) -> Plate:
+def make_clean_plate(scene: TrainingScene, name: str, longest_side: int, n_frames: int = MAX_FRAMES) -> CleanPlate:
     """The plate of training camera `name`, shrunk so that no side exceeds `longest_side`.
 
     n_frames: it is the median over at most so many frames, evenly spread over the recording; with 1, frame 0 alone.
@@ -57,9 +58,9 @@ def make_plate(scene: TrainingScene, name: str, longest_side: int, n_frames: int
     # Shrunk one by one: a 4K recording's frames do not fit into memory together.
     for i, t in enumerate(frames):
         wet = cv2.dilate(scene.mask(name, t).astype(np.uint8), disc) > 0
-        frame = shrunk(Plate(camera, scene.image(name, t), ~wet), longest_side)
+        frame = shrunk(CleanPlate(camera, scene.image(name, t), ~wet), longest_side)
         images[i], dry[i] = frame.image, frame.seen
-    return Plate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)))
+    return CleanPlate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)))
 
 
 def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -80,7 +81,7 @@ def _shrunk_camera(camera: Camera, longest_side: int) -> Camera:
     return camera if factor == 1.0 else camera.scaled(factor)
 
 
-def shrunk(plate: Plate, longest_side: int) -> Plate:
+def shrunk(plate: CleanPlate, longest_side: int) -> CleanPlate:
     """`plate`, smaller so that no side exceeds `longest_side`."""
     small = _shrunk_camera(plate.camera, longest_side)
     if small is plate.camera:
@@ -91,4 +92,4 @@ def shrunk(plate: Plate, longest_side: int) -> Plate:
     total = cv2.resize((plate.image * plate.seen[..., None]).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     kept = np.asarray(share > 0.9)
     mean = np.where(kept[..., None], total / np.maximum(share, 1e-6)[..., None], np.float32(0))
-    return Plate(small, np.clip(np.rint(mean), 0, 255).astype(np.uint8), kept)
+    return CleanPlate(small, np.clip(np.rint(mean), 0, 255).astype(np.uint8), kept)

@@ -1,10 +1,10 @@
-"""How deep every plate's pixels lie: by plane sweep where two views agree, else from the scene's sparse points.
+"""Depth of every clean plate's pixels: by plane sweep where two views agree, else from the scene's sparse points.
 
 Structure from motion gives one to a few thousand points, few of them on smooth surfaces, so a container may have none.
-The sweep (sweep.py) sees its edges. Where a sweep is not confirmed by another view's, a plane's inverse depth being an
-affine function of the pixel, each view's inverse depth is fitted affinely to the sparse points around a pixel. Without
-sparse points a background's anchors draw depths at random (`guessed`): most within the space that all training cameras
-look at, the rest far behind.
+The sweep (plane_sweep.py) sees its edges. Where no other view's sweep confirms a depth, each view's inverse depth is
+fitted affinely to the sparse points around a pixel: on a plane, inverse depth is an affine function of the pixel.
+Without sparse points, depths are drawn at random (`guessed`): most within the space that all training cameras look at,
+the rest far behind.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from splashbench.background.clean_plate import Plate, shrunk
+from splashbench.background.clean_plate import CleanPlate, shrunk
 from splashbench.background.plane_sweep import PLANES, inverse_depth
 from splashbench.scene import Camera
 
@@ -71,7 +71,7 @@ def lift(camera: Camera, uv: NDArray, inverse: NDArray) -> NDArray[np.float64]:
     return world
 
 
-def depth_maps(points: NDArray[np.float32] | None, plates: list[Plate]) -> list[DepthMap]:
+def depth_maps(points: NDArray[np.float32] | None, plates: list[CleanPlate]) -> list[DepthMap]:
     """Sweep all plates; points: sparse points [N, 3 or more], or None. Empty with fewer than two plates."""
     if len(plates) < 2:
         return []

@@ -1,4 +1,4 @@
-"""Dense inverse depth of every plate by plane sweep: where a pixel's depth is right, the other views show its colour.
+"""Dense inverse depth of every clean plate by plane sweep: at the right depth, other views show a pixel's colour.
 
 For planes of constant depth the other plates are warped into a view by homographies; each plane costs the colour
 difference to the two views that agree best, so that a view to which the pixel is hidden does no harm. The costs are
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.background.clean_plate import Plate
+from splashbench.background.clean_plate import CleanPlate
 from splashbench.scene import Camera
 
 PLANES = 96
@@ -29,10 +29,10 @@ _PRIOR = 0.03
 _INDISTINCT = 0.003
 
 Map = NDArray[np.float32]
-_MEAN_COLOUR = np.array([[1, 1, 1, 0]], np.float32) / 3
+_MEAN_COLOR = np.array([[1, 1, 1, 0]], np.float32) / 3
 
 
-def inverse_depth(reference: int, plates: list[Plate], low: float, high: float, prior: Map | None) -> Map:
+def inverse_depth(reference: int, plates: list[CleanPlate], low: float, high: float, prior: Map | None) -> Map:
     """Inverse depth [H, W] of plate number `reference`, looked for between `low` and `high`.
 
     prior: [H, W] inverse depths that break ties where the images say little, or None.
@@ -65,7 +65,7 @@ def _difference(image: Map, source: Map, homography: NDArray[np.float64]) -> Map
     """Mean absolute colour difference [H, W] of two plates with `seen` as fourth channel, truncated."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(source, homography, image.shape[1::-1], flags=flags)
-    difference = cv2.transform(cv2.absdiff(image, warped), _MEAN_COLOUR)
+    difference = cv2.transform(cv2.absdiff(image, warped), _MEAN_COLOR)
     return np.where(warped[..., 3] > 0.99, np.minimum(difference, _TRUNCATION), np.float32(_UNSEEN))
 
 

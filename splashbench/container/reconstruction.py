@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from splashbench.background.clean_plate import make_plate
+from splashbench.background.clean_plate import make_clean_plate
 from splashbench.background.depth import SWEEP_SIDE, DepthMap, depth_maps, pixels_at
 from splashbench.container.entry import in_pairs, masks_of, require_place, write_entry
 from splashbench.container.verification import Projection, overlay, verify
@@ -143,7 +143,9 @@ def container_from_footage(scene: Scene, masked: Scene | None = None) -> Reconst
     where = (masked or scene).directory / "container_mask"
     training = scene.training()
     # All views are swept: those without a mask confirm the others' depths.
-    plates = [make_plate(training, name, SWEEP_SIDE) for name in track(training.train, "collecting what stands still")]
+    plates = [
+        make_clean_plate(training, name, SWEEP_SIDE) for name in track(training.train, "collecting what stands still")
+    ]
     maps = depth_maps(training.initial_points(), plates)
     views = [
         _PlateView(mask_cameras[name], masks[name], depth, plate.seen)

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splashbench.errors import SplashbenchError
-from splashbench.gaussians.losses import l1
+from splashbench.gaussians.color_loss import l1
+from splashbench.gaussians.dynamic_model import DynamicModel, Splats
 from splashbench.gaussians.optimizer import RowOptimizer
 from splashbench.gaussians.photographs import Photographs
-from splashbench.gaussians.splats import DynamicModel, Splats
 from splashbench.gaussians.ssim import SsimTarget, ssim
 from splashbench.scene import Camera
 
 _SSIM_WEIGHT = 0.2
 
 
-class Density(Protocol):
-    """How primitives come and go: density.py, or a method's own."""
+class PrimitiveControl(Protocol):
+    """How primitives come and go: density_control.py, or a method's own."""
 
     def wants_gradients(self, step: int) -> bool:
         """Whether `observe` is to be called at `step`."""
@@ -43,7 +43,7 @@ class Density(Protocol):
 
 
 @dataclass(frozen=True)
-class History:
+class FitHistory:
     """How the fit went: PSNR [steps] in dB of the training photographs, whole images, each as it was rendered."""
 
     psnr: NDArray[np.float32]
@@ -58,11 +58,11 @@ class History:
 def fit_dynamic(
     model: DynamicModel,
     optimizer: RowOptimizer,
-    density: Density,
+    density: PrimitiveControl,
     photographs: Photographs,
     progress: Callable[[float], None],
     begin_step: Callable[[int], float] = lambda step: 0.0,
-) -> History:
+) -> FitHistory:
     """Fit `model` in place, over the optimizer's iterations.
 
     begin_step: called before every step; what it returns is added to the step's times, such as noise.
@@ -111,4 +111,4 @@ def fit_dynamic(
         psnr[step] = -10 * math.log10(max(float(np.mean(errors)), 1e-10))
         if step % 10 == 0:
             progress(step / optimizer.iterations)
-    return History(psnr)
+    return FitHistory(psnr)

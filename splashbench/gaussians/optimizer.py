@@ -23,7 +23,7 @@ _BESIDE_MUON = 0.1
 
 
 @dataclass(frozen=True)
-class Rate:
+class LearningRate:
     """A learning rate that falls exponentially from `first` to `last` until the share `until` of the fit.
 
     until: over 1 where the fit ends before. hold: share of the fit until which it stays `first`. begin: share before
@@ -37,13 +37,13 @@ class Rate:
     hold: float = 0.0
 
     @classmethod
-    def constant(cls, value: float) -> Rate:
+    def constant(cls, value: float) -> LearningRate:
         """The same all along."""
         return cls(value, value)
 
-    def short(self) -> Rate:
+    def short(self) -> LearningRate:
         """The same for a good third of a short fit; then it falls to a fortieth, for the last quarter."""
-        return Rate(self.first, self.first * _SHORT_LAST, _SHORT_UNTIL, self.begin, _SHORT_HOLD)
+        return LearningRate(self.first, self.first * _SHORT_LAST, _SHORT_UNTIL, self.begin, _SHORT_HOLD)
 
     def at(self, done: float) -> float:
         """The rate when the share `done` of the fit is done."""
@@ -64,7 +64,7 @@ class RowOptimizer:
     def __init__(
         self,
         model: nn.Module,
-        rates: Mapping[str, Rate],
+        rates: Mapping[str, LearningRate],
         rows: Collection[str],
         iterations: int,
         orthogonal: Collection[str] = (),

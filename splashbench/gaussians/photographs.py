@@ -19,7 +19,7 @@ _KEPT_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
-class Photograph:
+class TrainingPhotograph:
     """One training view at one timestep: uint8 image [H, W, 3], its camera, and its time in [0, 1]."""
 
     camera: Camera
@@ -49,13 +49,13 @@ class Photographs:
     def __len__(self) -> int:
         return len(self._cameras) * self._scene.n_frames
 
-    def next(self) -> list[Photograph]:
+    def next(self) -> list[TrainingPhotograph]:
         """Views of one timestep."""
         if not self._queue:
             self._queue = self._epoch()
         return [self.photograph(name, t) for name, t in self._queue.pop()]
 
-    def some(self, count: int) -> list[Photograph]:
+    def some(self, count: int) -> list[TrainingPhotograph]:
         """At most `count` photographs, chosen at random, apart from the order of `next`."""
         pairs = [(name, t) for name in self._cameras for t in range(self._scene.n_frames)]
         return [self.photograph(*pairs[i]) for i in self._rng.permutation(len(pairs))[:count]]
@@ -69,11 +69,11 @@ class Photographs:
                 groups.append([(name, t) for name in order[start : start + self._per_step]])
         return [groups[i] for i in self._rng.permutation(len(groups))]
 
-    def photograph(self, name: str, t: int) -> Photograph:
+    def photograph(self, name: str, t: int) -> TrainingPhotograph:
         """Training view `name` at timestep `t`."""
         camera = self._cameras[name]
         time = unit_time(self._scene, float(self._scene.camera_times[name][t]))
-        return Photograph(camera, time, self._image(name, t, camera))
+        return TrainingPhotograph(camera, time, self._image(name, t, camera))
 
     def _image(self, name: str, t: int, camera: Camera) -> NDArray[np.uint8]:
         image = self._kept.get((name, t))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from splashbench.gaussians.density import DensitySettings
+from splashbench.gaussians.density_control import DensitySettings
 from splashbench.harness.contract import MethodConfig
 
 # A Gaussian larger than this share of the cameras' extent is split rather than cloned.
@@ -18,10 +19,10 @@ class SplattingSettings(MethodConfig):
 
     Attributes:
         iterations: steps; views_per_step: training views of one timestep in each.
-        static: where the points of the static scene come from, see gaussian_splatting/start.py; static_points, at most.
+        static: where the points of the static scene come from, see gaussians/initialization.py; static_points, at most.
         hull_points: points of the liquid's hull, over all frames together.
         start_opacity: of every Gaussian.
-        most: Gaussians at most.
+        max_gaussians: Gaussians at most.
         grow_from, grow_until: shares between which Gaussians are cloned and split, every `grow_every` steps.
         grow_gradient: mean screen gradient (normalised device coordinates) above which they are.
         prune_until: share until which faint ones are dropped.
@@ -33,13 +34,15 @@ class SplattingSettings(MethodConfig):
         longest_side: photographs are shrunk to this many pixels.
     """
 
+    renamed: ClassVar[Mapping[str, str]] = {"most": "max_gaussians"}
+
     iterations: int = Field(default=1000, ge=1, le=1_000_000)
     views_per_step: int = Field(default=5, ge=1, le=64)
     static: Literal["pixels", "points"] = "pixels"
     static_points: int = Field(default=6000, ge=10, le=5_000_000)
     hull_points: int = Field(default=4000, ge=0, le=5_000_000)
     start_opacity: float = Field(default=0.6, gt=0, lt=1)
-    most: int = Field(default=20_000, ge=10, le=10_000_000)
+    max_gaussians: int = Field(default=20_000, ge=10, le=10_000_000)
     grow_from: float = Field(default=0.1, ge=0, le=1)
     grow_until: float = Field(default=0.5, ge=0, le=1)
     grow_every: int = Field(default=100, ge=1)
@@ -60,7 +63,7 @@ class SplattingSettings(MethodConfig):
             every=self.grow_every,
             gradient=self.grow_gradient,
             large=_LARGE * extent,
-            most=self.most,
+            max_gaussians=self.max_gaussians,
             prune_until=round(self.prune_until * self.iterations),
             reset_every=self.reset_every,
             reset_until=round(self.reset_until * self.iterations),

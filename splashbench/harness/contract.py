@@ -130,10 +130,14 @@ class Run:
 
 
 class MethodConfig(BaseModel):
-    """Settings of a method. Subclass it with fields and fill `presets`: name -> the fields that differ."""
+    """Settings of a method. Subclass it with fields and fill `presets`: name -> the fields that differ.
+
+    renamed: settings that had another name in an earlier version, old -> new; who gives the old one is told the new.
+    """
 
     model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"best": {}}
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     @classmethod
     def preset(cls, name: str, overrides: Mapping[str, Any] | None = None) -> MethodConfig:
@@ -141,6 +145,9 @@ class MethodConfig(BaseModel):
         if name not in cls.presets:
             raise SplashbenchError(f"there is no preset {name!r}; choose one of {', '.join(cls.presets)}")
         values = dict(cls.presets[name]) | dict(overrides or {})
+        for old, new in cls.renamed.items():
+            if old in values and old not in cls.model_fields:
+                raise SplashbenchError(f"setting {old} is now called {new}; give {new}={values[old]}")
         try:
             return cls.model_validate(values)
         except ValidationError as error:

@@ -7,7 +7,7 @@ from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import sequence_bounds
 from splashbench.observe.initial_points import initial_points
-from splashbench.observe.occlusion import ContainerShadow
+from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.observe.signed_distance import (
     SignedDistanceFields,
     signed_distance_fields,
@@ -17,7 +17,7 @@ from splashbench.observe.silhouettes import Silhouettes
 
 __all__ = [
     "Bounds",
-    "ContainerShadow",
+    "ContainerOcclusion",
     "Grid",
     "SignedDistanceFields",
     "Silhouettes",

@@ -1,7 +1,6 @@
-"""What the container says about the liquid: where it hides points from a view, and where its walls are.
+"""Geometry of the container's mesh: its depth image in a camera, the points it hides, the distance to its walls.
 
-The mesh is the scene's (`Scene.container_mesh`). Walls hold no liquid, and a view says nothing about what lies behind
-them; a transparent container hides nothing.
+Pure geometry of the scene's mesh (`Scene.container_mesh`). What follows for carving is in occlusion.py.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 
 from splashbench.observe.grid import Grid
 from splashbench.observe.hull import carve_views, sequence_bounds
-from splashbench.observe.occlusion import CarvingContainer, ContainerShadow, focal_length
+from splashbench.observe.occlusion import CarvingOcclusion, ContainerOcclusion, focal_length
 from splashbench.observe.silhouettes import Silhouettes
 from splashbench.scene.camera import Camera
 
@@ -31,7 +31,7 @@ _DEVIATIONS = 6.0
 _ROUNDS = 2
 
 
-def distrust_failed_masks(silhouettes: Silhouettes, container: ContainerShadow | None = None) -> np.ndarray:
+def distrust_failed_masks(silhouettes: Silhouettes, container: ContainerOcclusion | None = None) -> np.ndarray:
     """Find the masks of `silhouettes` that show liquid but miss large parts of it, and replace them there.
 
     Returns those masks, bool [T, V]. Raises SplashbenchError when the masks have no common hull.
@@ -49,14 +49,14 @@ def distrust_failed_masks(silhouettes: Silhouettes, container: ContainerShadow |
     return silhouettes.failed_masks & ~before
 
 
-def missing_shares(silhouettes: Silhouettes, container: ContainerShadow | None = None) -> np.ndarray:
+def missing_shares(silhouettes: Silhouettes, container: ContainerOcclusion | None = None) -> np.ndarray:
     """Estimated share of the liquid that each mask misses: float64 [T, V], 0 in frames without a hull.
 
     Of a mask that is replaced only what is certain counts (`Silhouettes.certain_mask`): a hull that is too large would
     accuse the other masks.
     """
     grid = Grid.over(sequence_bounds(silhouettes, container), _CELLS)
-    carving = None if container is None else CarvingContainer(container, silhouettes, grid)
+    carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
     patches = [_Patches(camera, grid, carving, view) for view, camera in enumerate(silhouettes.cameras)]
     shape = (silhouettes.n_frames, len(silhouettes.views))
     covered = [np.zeros((silhouettes.n_frames, patch.count), dtype=bool) for patch in patches]
@@ -96,7 +96,7 @@ def missing_shares(silhouettes: Silhouettes, container: ContainerShadow | None =
 class _Patches:
     """The image of a view in square patches as large as a voxel, and the patch of each node of a grid."""
 
-    def __init__(self, camera: Camera, grid: Grid, carving: CarvingContainer | None, view: int) -> None:
+    def __init__(self, camera: Camera, grid: Grid, carving: CarvingOcclusion | None, view: int) -> None:
         nodes = grid.to_scene(np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3))
         pixels, depth = camera.project(nodes)
         seen = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)

@@ -2,7 +2,7 @@
 
 phi(x) = max over views of s_v(pi_v(x)) z_v(x) / f_v, with s_v the 2-D signed distance in pixels to the view's
 silhouette: positive as soon as one view contradicts x, sub-voxel sharp, and without a 3-D distance transform.
-A container adds where its walls are, and which views see x at all (shadow.py).
+A container adds where its walls are, and which views see x at all (occlusion.py).
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.kernels import carve_view
-from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingContainer, ContainerShadow, focal_length
-from splashbench.observe.silhouettes import MaskedScene, Silhouettes, Window
+from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion, focal_length
+from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
 from splashbench.parallel import each
 
 SEARCH_CELLS = 64
 REFINED_CELLS = 96
 
 #: the 2-D signed distance s_v of view number v, of a window of its image
-Distance = Callable[[int, Window | None], np.ndarray]
+Distance = Callable[[int, ImageWindow | None], np.ndarray]
 
 
 def carve(
-    silhouettes: Silhouettes, grid: Grid, distance: Distance, container: CarvingContainer | None = None
+    silhouettes: Silhouettes, grid: Grid, distance: Distance, container: CarvingOcclusion | None = None
 ) -> np.ndarray:
     """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v."""
     phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32) if container is None else container.outside.copy()
@@ -37,14 +37,14 @@ def carve(
     return phi
 
 
-def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingContainer | None = None) -> np.ndarray:
+def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None = None) -> np.ndarray:
     """Hull distance of frame `t` (see `carve`); LIMIT_VOXELS everywhere in a frame without liquid."""
     if not silhouettes.has_liquid(t):
         return np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
     return carve(silhouettes, grid, lambda view, window: silhouettes.distance(view, t, window), container)
 
 
-def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingContainer | None = None) -> np.ndarray:
+def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None = None) -> np.ndarray:
     """What each view alone is certain of in frame `t`: float32 [V, nx, ny, nz] in voxels, < 0 in its silhouette."""
     views = np.full((len(silhouettes.cameras), *grid.shape), -LIMIT_VOXELS, dtype=np.float32)
     carvers = each(
@@ -59,13 +59,13 @@ def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: Carving
 
 
 def _carver(
-    silhouettes: Silhouettes, view: int, distance: Distance, container: CarvingContainer | None
+    silhouettes: Silhouettes, view: int, distance: Distance, container: CarvingOcclusion | None
 ) -> Callable[[np.ndarray, Grid], None]:
     """What view number `view` says, as a function of phi and its grid: phi = max(phi, that), in place."""
     if container is not None and container.views:
-        shadow = container.views[view]
-        evidence = shadow.evidence(distance(view, shadow.window))
-        return lambda phi, grid: shadow.carve(phi, grid, evidence)
+        occlusion = container.views[view]
+        evidence = occlusion.evidence(distance(view, occlusion.window))
+        return lambda phi, grid: occlusion.carve(phi, grid, evidence)
     camera, corner = silhouettes.cameras[view], silhouettes.windows[view].corner
     silhouette = distance(view, None)
 
@@ -103,7 +103,7 @@ def _meeting_point(silhouettes: Silhouettes) -> np.ndarray:
     return np.linalg.lstsq(normal, right, rcond=None)[0]
 
 
-def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerShadow | None = None) -> Bounds:
+def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerOcclusion | None = None) -> Bounds:
     """Box around the union of the hulls of all frames, scene units, without padding.
 
     container: where given, the box leaves out what it does not allow, and holds what it may hide.
@@ -121,7 +121,7 @@ def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerShadow
     # First what all frames together allow: no frame's liquid can lie outside it, and it costs one carving only.
     for _ in range(3):
         grid = Grid.over(bounds, SEARCH_CELLS)
-        carving = None if container is None else CarvingContainer(container, silhouettes, grid)
+        carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
         common = _inside(carve(silhouettes, grid, silhouettes.sequence_distance, carving), grid, tolerance=1.0)
         if common is None:
             raise SplashbenchError(
@@ -130,7 +130,7 @@ def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerShadow
             )
         bounds = common
     grid = Grid.over(bounds.padded(0.02), REFINED_CELLS)
-    carving = None if container is None else CarvingContainer(container, silhouettes, grid)
+    carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
     nearest = np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
     for t in range(silhouettes.n_frames):
         np.minimum(nearest, carve_frame(silhouettes, grid, t, carving), out=nearest)

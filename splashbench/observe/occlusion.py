@@ -1,8 +1,8 @@
-"""Carving around a container: what it hides is no evidence of absence, and its walls hold no liquid.
+"""Carving around a container: a view is no evidence about what the container hides, and walls hold no liquid.
 
-A view whose line of sight to x the container blocks says nothing about x; x must be seen by two views all the same.
-In a view the hidden pixels join the silhouette, at each depth those that are hidden there, so that phi keeps its
-sub-voxel outline where the view sees and does not break off where the container begins.
+A view whose line of sight to x the container blocks says nothing about x. At least two views must see x all the same.
+In a view the hidden pixels join the silhouette, at each depth those that are hidden there. So phi keeps its sub-voxel
+outline where the view sees, and does not break off where the container begins.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from splashbench.observe.container import depth_image, hidden, solid_distance
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import carve_hidden_view
-from splashbench.observe.silhouettes import NO_EVIDENCE, Silhouettes, Window, inner_distance, signed_distance_2d
+from splashbench.observe.silhouettes import NO_EVIDENCE, ImageWindow, Silhouettes, inner_distance, signed_distance_2d
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.scene import Scene, TrainingScene
@@ -26,7 +26,7 @@ _LAYERS = 4
 # Stored in eighths of a pixel, to halve the memory.
 _PER_PIXEL = 8
 _FARTHEST_PIXELS = 4000.0
-# Voxels behind the mesh's surface where its shadow begins, for errors of the mesh and of its place.
+# Voxels behind the mesh's surface where it begins to hide, for errors of the mesh and of its place.
 _TOLERANCE_VOXELS = 1.0
 
 
@@ -36,7 +36,7 @@ def focal_length(camera: Camera) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ContainerShadow:
+class ContainerOcclusion:
     """The container as carving needs it.
 
     mesh: in scene units. gravity: unit vector [3] or None; where known, no liquid lies deeper than the mesh's lowest
@@ -48,7 +48,7 @@ class ContainerShadow:
     hides: bool = True
 
     @classmethod
-    def of(cls, scene: Scene | TrainingScene) -> ContainerShadow | None:
+    def of(cls, scene: Scene | TrainingScene) -> ContainerOcclusion | None:
         """The container of `scene`, or None where it has no mesh."""
         mesh = scene.container_mesh()
         if mesh is None:
@@ -67,11 +67,11 @@ class ContainerShadow:
         return np.clip(distance, -LIMIT_VOXELS, LIMIT_VOXELS)
 
 
-class ViewShadow:
+class ViewOcclusion:
     """What the container hides from one view: its depth, and the hidden pixels at growing depths."""
 
-    def __init__(self, camera: Camera, mesh: ContainerMesh, window: Window) -> None:
-        """window: of the view's silhouette; the shadow's own holds it and the whole container."""
+    def __init__(self, camera: Camera, mesh: ContainerMesh, window: ImageWindow) -> None:
+        """window: of the view's silhouette; the occlusion's own holds it and the whole container."""
         import cv2
 
         self.camera = camera
@@ -80,7 +80,7 @@ class ViewShadow:
         depth = cv2.erode(depth, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         covered = np.isfinite(depth)
         if covered.any():
-            window = window.joined(Window.around(covered))
+            window = window.joined(ImageWindow.around(covered))
         self.window = window
         self.nearest = np.ascontiguousarray(depth[window.slices])
         found = self.nearest[np.isfinite(self.nearest)]
@@ -141,26 +141,26 @@ class ViewShadow:
         )
 
 
-class CarvingContainer:
-    """A `ContainerShadow` made ready for the views of `silhouettes` on `grid`.
+class CarvingOcclusion:
+    """A `ContainerOcclusion` made ready for the views of `silhouettes` on `grid`.
 
     Attributes:
         outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say.
         views: what it hides from each view; empty for a container that hides nothing.
     """
 
-    def __init__(self, container: ContainerShadow, silhouettes: Silhouettes, grid: Grid) -> None:
+    def __init__(self, container: ContainerOcclusion, silhouettes: Silhouettes, grid: Grid) -> None:
         self.outside = container.forbidden(grid)
-        self.views: list[ViewShadow] = []
+        self.views: list[ViewOcclusion] = []
         if container.hides:
             for camera, window in zip(silhouettes.cameras, silhouettes.windows):
-                self.views.append(ViewShadow(camera, container.mesh, window))
+                self.views.append(ViewOcclusion(camera, container.mesh, window))
             np.maximum(self.outside, -self._seen_twice(grid), out=self.outside)
 
     def _seen_twice(self, grid: Grid) -> np.ndarray:
         """Voxels by which a node lies within what at least two views see; < 0 where fewer do."""
         best = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32)
         second = best.copy()
-        for shadow in self.views:
-            shadow.carve(best, grid, shadow.visibility(), second)
+        for view in self.views:
+            view.carve(best, grid, view.visibility(), second)
         return second

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splashbench.observe.silhouettes import MaskedScene, Window
+from splashbench.observe.silhouettes import ImageWindow, MaskedScene
 from splashbench.scene.camera import Camera
 
 #: pixels per voxel that are kept, at least
@@ -52,7 +52,9 @@ def reduced(scene: MaskedScene, cells: int) -> MaskedScene:
     """
     longest = []
     for view in scene.train:
-        windows = [Window.around(mask) for mask in (scene.mask(view, t) for t in range(scene.n_frames)) if mask.any()]
+        windows = [
+            ImageWindow.around(mask) for mask in (scene.mask(view, t) for t in range(scene.n_frames)) if mask.any()
+        ]
         if windows:
             whole = windows[0]
             for window in windows[1:]:

@@ -16,7 +16,7 @@ from splashbench.observe.failures import distrust_failed_masks
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_frame, sequence_bounds
 from splashbench.observe.kernels import sample
-from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingContainer, ContainerShadow
+from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion
 from splashbench.observe.silhouettes import MaskedScene, Silhouettes
 
 DistanceMethod = Literal["silhouette", "carve"]
@@ -76,13 +76,13 @@ def signed_distance_frames(
     silhouettes: Silhouettes,
     grid: Grid,
     method: DistanceMethod = "silhouette",
-    container: ContainerShadow | None = None,
+    container: ContainerOcclusion | None = None,
 ) -> Iterator[np.ndarray]:
     """phi of one frame after another on `grid`, float32 [nx, ny, nz] in voxels: no more than one frame in memory.
 
     container: where given, no liquid is in its walls, and what it hides from a view is not held against the liquid.
     """
-    carving = None if container is None else CarvingContainer(container, silhouettes, grid)
+    carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
     for t in range(silhouettes.n_frames):
         phi = carve_frame(silhouettes, grid, t, carving)
         yield phi if method == "silhouette" else signed_distance_of(phi < 0)
@@ -93,7 +93,7 @@ def signed_distance_fields(
     cells_longest_axis: int = 96,
     views: Sequence[str] | None = None,
     method: DistanceMethod = "silhouette",
-    container: ContainerShadow | None = None,
+    container: ContainerOcclusion | None = None,
     find_failures: bool = False,
 ) -> SignedDistanceFields:
     """phi of all frames from the masks of `views` (all training views by default).

@@ -42,7 +42,7 @@ class MaskedScene(Protocol):
 
 
 @dataclass(frozen=True)
-class Window:
+class ImageWindow:
     """Rows [y0, y1) and columns [x0, x1) of an image."""
 
     y0: int
@@ -51,7 +51,7 @@ class Window:
     x1: int
 
     @classmethod
-    def around(cls, mask: np.ndarray, margin: int = 0) -> Window:
+    def around(cls, mask: np.ndarray, margin: int = 0) -> ImageWindow:
         """The bounding box of `mask` [H, W], `margin` pixels larger within the image; two pixels where it is empty."""
         height, width = mask.shape
         rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
@@ -64,9 +64,11 @@ class Window:
             min(int(columns[-1]) + 1 + margin, width),
         )
 
-    def joined(self, other: Window) -> Window:
+    def joined(self, other: ImageWindow) -> ImageWindow:
         """The smallest window that holds both."""
-        return Window(min(self.y0, other.y0), max(self.y1, other.y1), min(self.x0, other.x0), max(self.x1, other.x1))
+        return ImageWindow(
+            min(self.y0, other.y0), max(self.y1, other.y1), min(self.x0, other.x0), max(self.x1, other.x1)
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,7 +134,7 @@ class Silhouettes:
         self.views = tuple(scene.train if views is None else views)
         self.cameras = [scene.cameras[view] for view in self.views]
         self.n_frames = scene.n_frames
-        self.windows: list[Window] = []
+        self.windows: list[ImageWindow] = []
         self._packed: list[list[np.ndarray]] = []
         self.sees_liquid = np.zeros((scene.n_frames, len(self.views)), dtype=bool)
         full = True
@@ -209,7 +211,7 @@ class Silhouettes:
         near = [*trusted[trusted < t][-1:].tolist(), *trusted[trusted > t][:1].tolist()]
         return near if len(near) == 2 and near[1] - t <= _NEIGHBOURS and t - near[0] <= _NEIGHBOURS else []
 
-    def distance(self, view: int, t: int, window: Window | None = None) -> np.ndarray:
+    def distance(self, view: int, t: int, window: ImageWindow | None = None) -> np.ndarray:
         """2-D signed distance of view number `view` at the time of frame `t`, float32, of `window`.
 
         window: one that holds the view's own, which is the default.
@@ -220,18 +222,18 @@ class Silhouettes:
             return distance
         return blended(distance, self._frame_distance(view, second, window), share)
 
-    def sequence_distance(self, view: int, window: Window | None = None) -> np.ndarray:
+    def sequence_distance(self, view: int, window: ImageWindow | None = None) -> np.ndarray:
         """2-D signed distance to everything that view number `view` ever sees as liquid, of `window`."""
         return self._distance(view, self.sequence_mask(view), window)
 
-    def certain_distance(self, view: int, t: int, window: Window | None = None) -> np.ndarray:
+    def certain_distance(self, view: int, t: int, window: ImageWindow | None = None) -> np.ndarray:
         """2-D signed distance to `certain_mask`, of `window`."""
         return self._distance(view, self.certain_mask(view, t), window)
 
-    def _frame_distance(self, view: int, t: int, window: Window | None) -> np.ndarray:
+    def _frame_distance(self, view: int, t: int, window: ImageWindow | None) -> np.ndarray:
         return self._distance(view, self.evidence_mask(view, t), window)
 
-    def _distance(self, view: int, mask: np.ndarray, window: Window | None) -> np.ndarray:
+    def _distance(self, view: int, mask: np.ndarray, window: ImageWindow | None) -> np.ndarray:
         own = self.windows[view]
         if window is not None and window != own:
             mask = np.pad(mask, ((own.y0 - window.y0, window.y1 - own.y1), (own.x0 - window.x0, window.x1 - own.x1)))
@@ -241,7 +243,7 @@ class Silhouettes:
         return signed_distance_2d(mask)
 
 
-def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], Window, np.ndarray, bool]:
+def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], ImageWindow, np.ndarray, bool]:
     """Masks of a view as packed bits of their common window, that window, which show liquid [T], whether all are full.
 
     Packed one by one, as all masks at once would be eight times as large.
@@ -255,7 +257,7 @@ def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], Window, np.n
         full &= bool(mask.all())
         whole.append(np.packbits(mask))
     assert ever is not None
-    window = Window.around(ever, MARGIN_PIXELS)
+    window = ImageWindow.around(ever, MARGIN_PIXELS)
     sees = np.array([bits.any() for bits in whole])
     for t, bits in enumerate(whole):
         mask = np.unpackbits(bits, count=ever.size).reshape(ever.shape)[window.slices]

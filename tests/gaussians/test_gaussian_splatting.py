@@ -11,14 +11,14 @@ import torch
 from torch import nn
 
 from splashbench.errors import SplashbenchError
-from splashbench.gaussians import harmonics
-from splashbench.gaussians.density import DensityControl, DensitySettings
-from splashbench.gaussians.fitting import History
-from splashbench.gaussians.mixed import MixedFitted
-from splashbench.gaussians.optimizer import Rate, RowOptimizer
+from splashbench.gaussians import spherical_harmonics as harmonics
+from splashbench.gaussians.density_control import DensityControl, DensitySettings
+from splashbench.gaussians.dynamic_model import DynamicModel, Splats, ellipsoids
+from splashbench.gaussians.fitting import FitHistory
+from splashbench.gaussians.initialization import hull_points, joined, plain_color, static_points
+from splashbench.gaussians.mixed_model import MixedFitted
+from splashbench.gaussians.optimizer import LearningRate, RowOptimizer
 from splashbench.gaussians.photographs import Photographs, unit_time
-from splashbench.gaussians.splats import DynamicModel, Splats, ellipsoids
-from splashbench.gaussians.start import hull_points, joined, plain_color, static_points
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.harness.discovery import load_method
@@ -76,14 +76,14 @@ class TestHarmonics:
 
 
 def test_a_rate_begins_falls_and_stays() -> None:
-    rate = Rate(1.0, 0.01, until=0.5, begin=0.1)
+    rate = LearningRate(1.0, 0.01, until=0.5, begin=0.1)
     assert [rate.at(done) for done in (0.05, 0.25, 0.5, 1.0)] == pytest.approx([0, 0.1, 0.01, 0.01])
-    held = Rate(1.0, 0.01, until=0.6, hold=0.4)
+    held = LearningRate(1.0, 0.01, until=0.6, hold=0.4)
     assert [held.at(done) for done in (0.0, 0.4, 0.5, 0.6, 1.0)] == pytest.approx([1, 1, 0.1, 0.01, 0.01])
 
 
 def test_a_short_fit_comes_to_rest_before_it_ends() -> None:
-    short = Rate(0.3, 0.2, until=0.5, begin=0.1).short()
+    short = LearningRate(0.3, 0.2, until=0.5, begin=0.1).short()
     assert [short.at(done) for done in (0.05, 0.1, 0.3)] == pytest.approx([0, 0.3, 0.3])
     assert 0.0075 < short.at(0.6) < 0.3
     assert [short.at(done) for done in (0.75, 1.0)] == pytest.approx([0.0075, 0.0075])
@@ -130,7 +130,7 @@ ROWS = ("positions", "log_scales", "quaternions", "opacity_logits")
 
 
 def optimizer_of(model: Table, iterations: int = 100) -> RowOptimizer:
-    return RowOptimizer(model, {name: Rate.constant(0.01) for name in ROWS}, ROWS, iterations)
+    return RowOptimizer(model, {name: LearningRate.constant(0.01) for name in ROWS}, ROWS, iterations)
 
 
 class TestRows:
@@ -166,7 +166,7 @@ class TestRows:
 def test_an_orthogonal_step_turns_every_direction_of_a_matrix_by_as_much() -> None:
     network = nn.Sequential(nn.Linear(16, 8), nn.Linear(8, 2))
     first, bias, last = (p.detach().clone() for p in (network[0].weight, network[0].bias, network[1].weight))
-    rates = {"0": Rate.constant(0.01), "1": Rate.constant(0.01)}
+    rates = {"0": LearningRate.constant(0.01), "1": LearningRate.constant(0.01)}
     optimizer = RowOptimizer(network, rates, (), 10, orthogonal=("0",))
     strong = torch.zeros(8, 16)
     strong[0] = 100.0
@@ -192,7 +192,7 @@ def look() -> Camera:
 
 
 def density_of(model: Table, **changes: float) -> DensityControl:
-    settings = {"start": 0, "stop": 100, "every": 1, "gradient": 1.0, "large": 0.1, "most": 100, **changes}
+    settings = {"start": 0, "stop": 100, "every": 1, "gradient": 1.0, "large": 0.1, "max_gaussians": 100, **changes}
     return DensityControl(optimizer_of(model), DensitySettings(**settings))  # type: ignore[arg-type]
 
 
@@ -225,7 +225,7 @@ class TestDensity:
 
     def test_large_ones_are_split_within_themselves(self) -> None:
         model = Table(np.zeros((400, 3)), scale=0.5)
-        density = density_of(model, most=1000)
+        density = density_of(model, max_gaussians=1000)
         pull(model, density, list(range(400)))
         density.after_step(0)
         assert len(model.positions) == 800
@@ -238,7 +238,7 @@ class TestDensity:
         model = Table(np.zeros((6, 3)))
         with torch.no_grad():
             model.opacity_logits[0] = -9.0
-        density = density_of(model, most=7)
+        density = density_of(model, max_gaussians=7)
         pull(model, density, [0, 3, 4, 5])
         density.observe(look(), model.splats(None, look()), torch.tensor([0.0, 0, 0, 0, 99, 99])[:, None].repeat(1, 3))
         with torch.no_grad():
@@ -393,7 +393,7 @@ class TestPlainViews:
     )
     def test_it_is_drawn_and_kept(self, name: str, plain: TrainingScene, balls: Scene, tmp_path: Path) -> None:
         method = load_method(name)
-        small = {"iterations": 3, "hull_points": 60, "most": 100}
+        small = {"iterations": 3, "hull_points": 60, "max_gaussians": 100}
         fitted = method.fit(plain, method.Config.preset("quick", small), Run(directory=tmp_path))
         camera = balls.cameras["6"]
         image = fitted.render(camera, 0.1).rgb
@@ -446,5 +446,5 @@ class TestLiquid:
 
 
 def test_the_gain_of_the_last_quarter_is_told() -> None:
-    assert History(np.linspace(10, 18, 801, dtype=np.float32)).gained_in_last_quarter() == pytest.approx(2, abs=0.02)
-    assert History(np.full(3, 20, np.float32)).gained_in_last_quarter() == 0
+    assert FitHistory(np.linspace(10, 18, 801, dtype=np.float32)).gained_in_last_quarter() == pytest.approx(2, abs=0.02)
+    assert FitHistory(np.full(3, 20, np.float32)).gained_in_last_quarter() == 0

@@ -24,7 +24,8 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_image, read_json, write_json
 from splashbench.gaussians.official.checkpoint import read_weights
-from splashbench.gaussians.official.importer import Arguments, OfficialFitted
+from splashbench.gaussians.official.model import OfficialFitted
+from splashbench.gaussians.official.output_folder import TrainingArguments
 from splashbench.gaussians.official.point_cloud import read_point_cloud
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.external.importers import Importer, load_importer, registered_importers
@@ -675,7 +676,7 @@ def test_arguments_are_read_as_python_prints_them(tmp_path: Path) -> None:
     layouts.write_arguments(
         tmp_path, loader="it's, here='x'", white_background=True, duration=50, offsets=[1.0, 2.0], data_device="cuda"
     )
-    arguments = Arguments.read(tmp_path)
+    arguments = TrainingArguments.read(tmp_path)
     assert arguments.text("source_path") == "/data, set/colmap_0"
     assert arguments.text("loader") == "it's, here='x'"
     assert arguments.number("duration") == 50

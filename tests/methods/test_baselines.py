@@ -11,7 +11,7 @@ import pytest
 from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.gaussians import fitting
-from splashbench.gaussians.density import DensityControl
+from splashbench.gaussians.density_control import DensityControl
 from splashbench.gaussians.optimizer import RowOptimizer
 from splashbench.harness.contract import Fitted, Run
 from splashbench.harness.discovery import load_method

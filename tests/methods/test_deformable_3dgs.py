@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.gaussians.mixed import MixedFitted
-from splashbench.gaussians.start import Start
+from splashbench.gaussians.initialization import StartingPoints
+from splashbench.gaussians.mixed_model import MixedFitted
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
@@ -18,9 +18,9 @@ from splashbench_methods.deformable_3dgs import Deformable3DGS
 from splashbench_methods.deformable_3dgs.deformation import Deformation, encode
 from splashbench_methods.deformable_3dgs.method import rates
 from splashbench_methods.deformable_3dgs.model import DeformableModel
-from splashbench_methods.deformable_3dgs.settings import Settings
+from splashbench_methods.deformable_3dgs.settings import DeformableSettings
 
-SMALL = {"iterations": 200, "static_points": 300, "hull_points": 200, "most": 700, "width": 16, "depth": 4}
+SMALL = {"iterations": 200, "static_points": 300, "hull_points": 200, "max_gaussians": 700, "width": 16, "depth": 4}
 
 
 @pytest.fixture(autouse=True)
@@ -31,8 +31,8 @@ def _one_thread() -> Iterator[None]:
 
 
 def fit(scene: Scene, directory: Path, seed: int = 0, **settings: object) -> MixedFitted:
-    config = Settings.preset("quick", {**SMALL, **settings})
-    assert isinstance(config, Settings)
+    config = DeformableSettings.preset("quick", {**SMALL, **settings})
+    assert isinstance(config, DeformableSettings)
     return Deformable3DGS().fit(scene.training(), config, Run(seed=seed, directory=directory))
 
 
@@ -72,18 +72,20 @@ class TestNetwork:
         for factor in (1.0, 100.0):
             torch.manual_seed(1)
             points = np.random.default_rng(0).uniform(-1, 1, (50, 3)).astype(np.float32)
-            start = Start(points * factor, points * 0 + 0.5, np.full(50, 0.1 * factor, np.float32), np.full(50, -1))
+            start = StartingPoints(
+                points * factor, points * 0 + 0.5, np.full(50, 0.1 * factor, np.float32), np.full(50, -1)
+            )
             models.append(DeformableModel.from_start(start, 0.5, 1, 4, 16))
         small, large = (model.at(0.4) for model in models)
         torch.testing.assert_close(small.means * 100, large.means, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(small.factors * 100, large.factors, rtol=1e-4, atol=1e-3)
-        config = Settings()
+        config = DeformableSettings()
         assert rates(config, 200.0)["positions"].first == pytest.approx(100 * rates(config, 2.0)["positions"].first)
 
 
 def test_the_published_rates_are_of_one_size_in_the_network_and_quick_heads_learn_slower() -> None:
     parts = [f"deformation.{part}" for part in ("layers", "shift", "turn", "growth")]
-    published, quick = (rates(Settings.preset(name, {}), 1.0) for name in ("paper", "quick"))
+    published, quick = (rates(DeformableSettings.preset(name, {}), 1.0) for name in ("paper", "quick"))
     assert {published[part].first for part in parts} == {8e-4}
     assert {published[part].last for part in parts} == {1.6e-6}
     layers, shift, turn, growth = (quick[part].first for part in parts)
@@ -95,7 +97,7 @@ def test_the_published_rates_are_of_one_size_in_the_network_and_quick_heads_lear
 def test_published_rates_fall_by_steps_so_that_fits_of_real_scenes_end_before_they_do(
     steps: int, positions: float, network: float
 ) -> None:
-    found = rates(Settings.preset("paper", {"iterations": steps}), 5.0)
+    found = rates(DeformableSettings.preset("paper", {"iterations": steps}), 5.0)
     assert found["positions"].at(1.0) == pytest.approx(positions)
     assert found["deformation.layers"].at(1.0) == pytest.approx(network)
 

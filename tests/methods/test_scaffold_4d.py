@@ -10,19 +10,19 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splashbench.gaussians.mixed import MixedFitted
-from splashbench.gaussians.start import Start
+from splashbench.gaussians.initialization import StartingPoints
+from splashbench.gaussians.mixed_model import MixedFitted
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera, Scene
 from splashbench_methods.scaffold_4d import Scaffold4D
 from splashbench_methods.scaffold_4d.growth import SpacetimeGrowth
-from splashbench_methods.scaffold_4d.model import SpacetimeAnchors, Variant
-from splashbench_methods.scaffold_4d.settings import Settings
+from splashbench_methods.scaffold_4d.model import SpacetimeAnchors, SpacetimeAnchorSpec
+from splashbench_methods.scaffold_4d.settings import Scaffold4DSettings
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 
-SMALL = {"iterations": 60, "views_per_step": 2, "static_points": 300, "hull_points": 400, "most": 900}
+SMALL = {"iterations": 60, "views_per_step": 2, "static_points": 300, "hull_points": 400, "max_anchors": 900}
 TIMES = np.linspace(0, 1, 11)
 
 
@@ -39,16 +39,18 @@ def look() -> Camera:
     return Camera("1", 96, 64, np.array([[96.0, 0, 48], [0, 96.0, 32], [0, 0, 1]]), w2c)
 
 
-def start_of(count: int, unit: float = 1.0) -> Start:
+def start_of(count: int, unit: float = 1.0) -> StartingPoints:
     """Half static points, half points of the hull at the frames in turn."""
     positions = np.random.default_rng(0).uniform(-0.8, 0.8, (count, 3)).astype(np.float32)
     frame = np.where(np.arange(count) % 2, np.arange(count) % len(TIMES), -1)
-    return Start(positions * unit, np.full((count, 3), 0.4, np.float32), np.full(count, 0.1 * unit, np.float32), frame)
+    return StartingPoints(
+        positions * unit, np.full((count, 3), 0.4, np.float32), np.full(count, 0.1 * unit, np.float32), frame
+    )
 
 
 def model_of(count: int = 12, unit: float = 1.0, **variant: object) -> SpacetimeAnchors:
     torch.manual_seed(1)
-    chosen = Variant(**{"children": 3, "base_color": True, "fastest": 2.0 * unit, **variant})  # type: ignore[arg-type]
+    chosen = SpacetimeAnchorSpec(**{"children": 3, "base_color": True, "fastest": 2.0 * unit, **variant})  # type: ignore[arg-type]
     return SpacetimeAnchors.from_start(start_of(count, unit), chosen, 0.6, 0.15, TIMES)
 
 
@@ -124,8 +126,10 @@ class TestGrowth:
     def grown(self, pulled: list[tuple[int, float]]) -> tuple[SpacetimeAnchors, int]:
         """A model after a round in which the loss pulled hard at children of anchors, at times."""
         model = model_of(20)
-        config = Settings.preset("quick", {"iterations": 100, "grow_from": 0, "grow_until": 1, "grow_every": 1})
-        assert isinstance(config, Settings)
+        config = Scaffold4DSettings.preset(
+            "quick", {"iterations": 100, "grow_from": 0, "grow_until": 1, "grow_every": 1}
+        )
+        assert isinstance(config, Scaffold4DSettings)
         optimizer = AnchorOptimizer(model, "short", 100)
         growth = SpacetimeGrowth(optimizer, 0.02, 0.1, config, np.random.default_rng(0))
         for anchor, time in pulled:
@@ -160,8 +164,8 @@ class TestGrowth:
 
 
 def fit(scene: Scene, directory: Path, seed: int = 0, **settings: object) -> MixedFitted:
-    config = Settings.preset("quick", {**SMALL, **settings})
-    assert isinstance(config, Settings)
+    config = Scaffold4DSettings.preset("quick", {**SMALL, **settings})
+    assert isinstance(config, Scaffold4DSettings)
     return Scaffold4D().fit(scene.training(), config, Run(seed=seed, directory=directory))
 
 

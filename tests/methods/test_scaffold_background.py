@@ -16,7 +16,7 @@ from splashbench.scene import Scene
 from splashbench_methods.controls.nothing import Nothing
 from splashbench_methods.scaffold_gs import Background, BackgroundSettings, ScaffoldGS, StaticScene, fit_background
 
-SETTINGS = BackgroundSettings(iterations=150, anchors=1500, children=3, longest_side=96)
+SETTINGS = BackgroundSettings(iterations=150, max_anchors=1500, children=3, longest_side=96)
 
 
 def psnr(image: np.ndarray, expected: np.ndarray, where: np.ndarray) -> float:
@@ -48,9 +48,9 @@ def test_where_liquid_passes_the_background_shows_what_lies_behind(balls: Scene,
     assert excess(rendered) < 0.25 * excess(liquid)
 
 
-TINY = BackgroundSettings(iterations=8, anchors=200, children=2, longest_side=64)
+TINY = BackgroundSettings(iterations=8, max_anchors=200, children=2, longest_side=64)
 GROWING = BackgroundSettings(
-    start="points", iterations=12, anchors=400, children=2, grow_until=1, grow_every=4, grow_gradient=1e-5
+    start="points", iterations=12, max_anchors=400, children=2, grow_until=1, grow_every=4, grow_gradient=1e-5
 )
 
 
@@ -250,7 +250,7 @@ def test_a_scene_without_sparse_points_is_fitted_too(balls_copy: Path):
 def test_progress_stays_within_the_part_that_was_asked_for(balls: Scene):
     heard: list[float] = []
     run = Run(seed=0, _report=lambda fraction, message: heard.append(fraction))
-    small = BackgroundSettings(iterations=25, anchors=100, children=1, longest_side=48)
+    small = BackgroundSettings(iterations=25, max_anchors=100, children=1, longest_side=48)
     fit_background(balls.training(), small, run, span=(0.2, 0.6))
     assert heard == sorted(heard)
     assert 0.2 <= heard[0] < heard[-1] < 0.6

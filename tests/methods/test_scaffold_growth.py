@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.background.clean_plate import Plate
-from splashbench.gaussians.anchors import AnchorSeed, sparse_anchors
-from splashbench.gaussians.screen import screen_gradients
+from splashbench.background.clean_plate import CleanPlate
+from splashbench.gaussians.anchor_seeds import AnchorSeed, sparse_anchors
+from splashbench.gaussians.screen_gradients import screen_gradients
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.render import rasterize
 from splashbench.scene import Camera
 from splashbench_methods.scaffold_gs import BackgroundSettings
 from splashbench_methods.scaffold_gs.fitting import fit_model
 from splashbench_methods.scaffold_gs.growth import Growth
-from splashbench_methods.scaffold_gs.model import AnchorModel, Gaussians, Variant
+from splashbench_methods.scaffold_gs.model import AnchorModel, DecodedGaussians, StaticAnchorSpec
 from splashbench_methods.scaffold_gs.optimizer import AnchorOptimizer
 
 
@@ -37,12 +37,12 @@ def wall_camera(x: float) -> Camera:
     return Camera(str(x), WIDTH, HEIGHT, np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]), w2c)
 
 
-def wall_plate(x: float) -> Plate:
+def wall_plate(x: float) -> CleanPlate:
     """The textured wall, seen from `wall_camera(x)`."""
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     a, b = x + (u - WIDTH / 2) / FOCAL * DISTANCE, (v - HEIGHT / 2) / FOCAL * DISTANCE
     waves = np.stack([np.sin(9 * a) * np.cos(7 * b), np.sin(6 * a + 8 * b), np.cos(11 * b)], axis=-1)
-    return Plate(wall_camera(x), (127 + 100 * waves).astype(np.uint8), np.ones((HEIGHT, WIDTH), bool))
+    return CleanPlate(wall_camera(x), (127 + 100 * waves).astype(np.uint8), np.ones((HEIGHT, WIDTH), bool))
 
 
 def wall_points(n: int) -> np.ndarray:
@@ -56,7 +56,7 @@ def growth_of(positions: np.ndarray, k: int = 2, **settings: object) -> Growth:
     torch.manual_seed(0)
     n = len(positions)
     seed = AnchorSeed(positions.astype(np.float32), np.full((n, 3), 0.5, np.float32), np.full(n, 0.1, np.float32), 0.02)
-    model = AnchorModel.from_seed(seed, Variant(k))
+    model = AnchorModel.from_seed(seed, StaticAnchorSpec(k))
     chosen = BackgroundSettings(children=k, grow_every=10, **settings)  # type: ignore[arg-type]
     return Growth(AnchorOptimizer(model, "published", 100), seed.voxel, chosen, np.random.default_rng(0))
 
@@ -66,7 +66,7 @@ def wall_grid(step: float = 0.2) -> np.ndarray:
     return np.stack([a.ravel(), b.ravel(), np.zeros(a.size)], axis=1)
 
 
-def seen(growth: Growth, opacities: torch.Tensor, gradients: torch.Tensor) -> Gaussians:
+def seen(growth: Growth, opacities: torch.Tensor, gradients: torch.Tensor) -> DecodedGaussians:
     """The model's Gaussians with other opacities, and with gradients of their means."""
     gaussians = growth.model.decode(np.array([0.0, 0, -DISTANCE]))
     means = gaussians.means.detach().requires_grad_()
@@ -166,7 +166,7 @@ class TestRound:
         assert len(growth.model) == 1
 
     def test_there_are_never_more_anchors_than_allowed(self):
-        growth = growth_of(wall_grid(), grow_gradient=1e-9, anchors=len(wall_grid()) + 5)
+        growth = growth_of(wall_grid(), grow_gradient=1e-9, max_anchors=len(wall_grid()) + 5)
         n = len(growth.model)
         for _ in range(10):
             growth.observe(wall_camera(0.0), seen(growth, torch.ones(2 * n), torch.ones(2 * n, 3)))
@@ -209,7 +209,7 @@ def test_growth_reconstructs_a_textured_wall_better_from_few_points():
     seed = sparse_anchors(wall_points(60), 2000)
 
     def psnr(**settings: object) -> tuple[float, int]:
-        chosen = BackgroundSettings(iterations=160, anchors=2000, grow_every=20, **settings)  # type: ignore[arg-type]
+        chosen = BackgroundSettings(iterations=160, max_anchors=2000, grow_every=20, **settings)  # type: ignore[arg-type]
         model = fit_model(seed, plates, chosen, np.full(3, 0.5, np.float32), 0, lambda fraction: None)
         with torch.no_grad():
             gaussians = model.decode(unseen.camera.center)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.background.clean_plate import Plate, make_plate, masked_median
+from splashbench.background.clean_plate import CleanPlate, make_clean_plate, masked_median
 from splashbench.background.depth import depth_maps, look_at
-from splashbench.gaussians.anchors import AnchorSeed, seed_anchors, sparse_anchors
-from splashbench.gaussians.losses import l1
-from splashbench.gaussians.splats import rotation_matrices
+from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
+from splashbench.gaussians.color_loss import l1
+from splashbench.gaussians.dynamic_model import rotation_matrices
 from splashbench.scene import Camera
 from splashbench_methods.scaffold_gs.fitting import pyramid
-from splashbench_methods.scaffold_gs.model import AnchorModel, Variant
+from splashbench_methods.scaffold_gs.model import AnchorModel, StaticAnchorSpec
 
 
 def arc_camera(name: str, degrees: float, width: int = 80, height: int = 60) -> Camera:
@@ -57,14 +57,14 @@ class TestPlate:
 
     def test_a_passing_liquid_leaves_no_trace_and_a_lasting_one_no_evidence(self, passing_liquid):
         scene, background = passing_liquid
-        plate = make_plate(scene, "1", longest_side=1000)
+        plate = make_clean_plate(scene, "1", longest_side=1000)
         assert 0 < (~plate.seen).sum() < 200
         assert not plate.seen[30, 40]
         np.testing.assert_array_equal(plate.image[plate.seen], background[plate.seen])
 
     def test_shrinking_moves_the_camera_along(self, passing_liquid):
         scene, background = passing_liquid
-        plate = make_plate(scene, "1", longest_side=40)
+        plate = make_clean_plate(scene, "1", longest_side=40)
         assert (plate.camera.width, plate.camera.height) == (40, 30)
         np.testing.assert_allclose(plate.camera.K[:2], scene.cameras["1"].K[:2] / 2)
         small = cv2.resize(background, (40, 30), interpolation=cv2.INTER_AREA)
@@ -76,7 +76,7 @@ class TestPlate:
         read: list[int] = []
         image = scene.image
         scene.image = lambda name, t: read.append(t) or image(name, t)
-        plate = make_plate(scene, "1", longest_side=1000, n_frames=1)
+        plate = make_clean_plate(scene, "1", longest_side=1000, n_frames=1)
         assert read == [0]
         assert not plate.seen[15, 15]
         assert plate.seen[15, 30]
@@ -107,9 +107,9 @@ def passing_liquid():
     return scene, scene.background
 
 
-def floor_plates() -> list[Plate]:
+def floor_plates() -> list[CleanPlate]:
     cameras = [arc_camera(str(i), degrees) for i, degrees in enumerate((-38, -19, 0, 19, 38))]
-    return [Plate(c, floor_color(floor_points(c)), np.ones((c.height, c.width), bool)) for c in cameras]
+    return [CleanPlate(c, floor_color(floor_points(c)), np.ones((c.height, c.width), bool)) for c in cameras]
 
 
 TABLE_HEIGHT = 1.0
@@ -124,7 +124,7 @@ def table_points(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.where(on_table[..., None], table, floor), on_table
 
 
-def table_plates() -> list[Plate]:
+def table_plates() -> list[CleanPlate]:
     plates = []
     for plate in floor_plates():
         points, on_table = table_points(plate.camera)
@@ -209,7 +209,7 @@ class TestAnchors:
 
 
 class TestModel:
-    def model(self, n: int = 20, variant: Variant = Variant(3)) -> AnchorModel:  # noqa: B008
+    def model(self, n: int = 20, variant: StaticAnchorSpec = StaticAnchorSpec(3)) -> AnchorModel:  # noqa: B008
         torch.manual_seed(0)
         rng = np.random.default_rng(0)
         seed = AnchorSeed(
@@ -235,7 +235,7 @@ class TestModel:
         np.testing.assert_allclose(torch.linalg.det(factors).abs().detach(), scales.prod(1).detach(), rtol=1e-3)
 
     def test_without_a_base_colour_the_seeds_colours_play_no_part(self):
-        base, plain = self.model(), self.model(variant=Variant(3, base_color=False))
+        base, plain = self.model(), self.model(variant=StaticAnchorSpec(3, base_color=False))
         with torch.no_grad():
             for model in (base, plain):
                 model.features[:, :3] += 9
@@ -248,15 +248,15 @@ class TestModel:
         one, other = self.model().decode(here), self.model().decode(there)
         assert all(torch.equal(one[i], other[i]) for i in (0, 1, 2))
         assert not torch.equal(one.colors, other.colors)
-        model = self.model(variant=Variant(3, view_dependent_shape=True))
+        model = self.model(variant=StaticAnchorSpec(3, view_dependent_shape=True))
         assert not torch.equal(model.decode(here).opacities, model.decode(there).opacities)
 
 
 class TestLoss:
-    def plate(self, seen: np.ndarray) -> Plate:
+    def plate(self, seen: np.ndarray) -> CleanPlate:
         rng = np.random.default_rng(0)
         camera = arc_camera("1", 0, seen.shape[1], seen.shape[0])
-        return Plate(camera, rng.integers(0, 256, (*seen.shape, 3)).astype(np.uint8), seen)
+        return CleanPlate(camera, rng.integers(0, 256, (*seen.shape, 3)).astype(np.uint8), seen)
 
     def test_unseen_pixels_carry_no_loss_and_no_gradient(self):
         seen = np.zeros((14, 17), bool)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splashbench.gaussians.mixed import MixedFitted
+from splashbench.gaussians.mixed_model import MixedFitted
 from splashbench.gaussians.photographs import Photographs
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
@@ -18,9 +18,9 @@ from splashbench.scene import Camera, Scene
 from splashbench_methods.spacetime_gaussians import SpacetimeGaussians, SpacetimeGaussiansLite
 from splashbench_methods.spacetime_gaussians.guided import PATCH, PER_RAY, along_worst_rays
 from splashbench_methods.spacetime_gaussians.model import SpacetimeModel, rays
-from splashbench_methods.spacetime_gaussians.settings import Settings
+from splashbench_methods.spacetime_gaussians.settings import SpacetimeSettings
 
-SMALL = {"iterations": 60, "views_per_step": 5, "static_points": 300, "hull_points": 400, "most": 1500}
+SMALL = {"iterations": 60, "views_per_step": 5, "static_points": 300, "hull_points": 400, "max_gaussians": 1500}
 VARIANTS = [SpacetimeGaussians, SpacetimeGaussiansLite]
 
 
@@ -34,8 +34,8 @@ def _one_thread() -> Iterator[None]:
 def fit(
     method: type[SpacetimeGaussians], scene: Scene, directory: Path, seed: int = 0, **settings: object
 ) -> MixedFitted:
-    config = Settings.preset("quick", {**SMALL, **settings})
-    assert isinstance(config, Settings)
+    config = SpacetimeSettings.preset("quick", {**SMALL, **settings})
+    assert isinstance(config, SpacetimeSettings)
     return method().fit(scene.training(), config, Run(seed=seed, directory=directory))
 
 
@@ -196,6 +196,6 @@ class TestGuidedSampling:
         assert len(times.round(decimals=3).unique()) == 1
 
     def test_it_keeps_to_the_limit(self, balls: Scene, tmp_path: Path) -> None:
-        settings = {"iterations": 2, "hull_points": 0, "grow_from": 1.0, "most": 305, "guided_until": 1.0}
+        settings = {"iterations": 2, "hull_points": 0, "grow_from": 1.0, "max_gaussians": 305, "guided_until": 1.0}
         model = fit(SpacetimeGaussiansLite, balls, tmp_path, **settings, guided_every=1).model
         assert len(model.positions) <= 305

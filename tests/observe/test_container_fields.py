@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from splashbench.observe import Bounds, ContainerShadow, Grid, Silhouettes, sequence_bounds, signed_distance_fields
+from splashbench.observe import Bounds, ContainerOcclusion, Grid, Silhouettes, sequence_bounds, signed_distance_fields
 from splashbench.observe.container import depth_image, hidden, solid_distance
-from splashbench.observe.occlusion import CarvingContainer
+from splashbench.observe.occlusion import CarvingOcclusion
 from splashbench.scene import Camera, ContainerMesh
 
 RADIUS = 0.25
@@ -63,8 +63,8 @@ class BallBehindAWall:
 
 
 @pytest.fixture(scope="module")
-def wall() -> ContainerShadow:
-    return ContainerShadow(box(*BallBehindAWall.WALL))
+def wall() -> ContainerOcclusion:
+    return ContainerOcclusion(box(*BallBehindAWall.WALL))
 
 
 def test_the_depth_of_a_plane_is_exact_in_every_pixel() -> None:
@@ -127,14 +127,14 @@ def test_an_open_mesh_has_no_inside() -> None:
     assert (solid_distance(ContainerMesh(shape.vertices, shape.faces[1:]), grid) >= 0).all()
 
 
-def test_points_behind_the_wall_are_hidden(wall: ContainerShadow) -> None:
+def test_points_behind_the_wall_are_hidden(wall: ContainerOcclusion) -> None:
     camera = BallBehindAWall().cameras["1"]
     depth = depth_image(wall.mesh, camera)
     points = np.array([[0, -0.2, 0], [0, 0.2, 0], [0.7, -0.2, 0], [0.5, -0.2, 0], [0, -9, 0], [5.0, 0, 0]])
     assert hidden(points, depth, camera, 0.06).tolist() == [True, False, False, False, False, False]
 
 
-def recall_and_excess(scene: BallBehindAWall, container: ContainerShadow | None) -> tuple[float, float]:
+def recall_and_excess(scene: BallBehindAWall, container: ContainerOcclusion | None) -> tuple[float, float]:
     """Share of the ball that the hull holds, and volume of the hull beside the ball in volumes of the ball."""
     fields = signed_distance_fields(scene, 48, container=container)
     grid = Grid.over(Bounds(np.full(3, -0.4), np.full(3, 0.4)), 60)
@@ -144,7 +144,7 @@ def recall_and_excess(scene: BallBehindAWall, container: ContainerShadow | None)
     return liquid[inside].mean(), (liquid & ~inside).sum() / inside.sum()
 
 
-def test_what_the_wall_hides_is_not_carved_away(wall: ContainerShadow) -> None:
+def test_what_the_wall_hides_is_not_carved_away(wall: ContainerOcclusion) -> None:
     scene = BallBehindAWall()
     blind, _ = recall_and_excess(scene, None)
     aware, excess = recall_and_excess(scene, wall)
@@ -152,11 +152,11 @@ def test_what_the_wall_hides_is_not_carved_away(wall: ContainerShadow) -> None:
     assert aware > 0.98
     assert excess < 0.6  # the two views that see the lower half bound it from two sides only
     # Through glass every view sees the ball, so its masks would be evidence again.
-    glass, _ = recall_and_excess(scene, ContainerShadow(wall.mesh, hides=False))
+    glass, _ = recall_and_excess(scene, ContainerOcclusion(wall.mesh, hides=False))
     assert glass == pytest.approx(blind, abs=0.02)
 
 
-def test_phi_runs_smoothly_over_the_edge_of_the_shadow(wall: ContainerShadow) -> None:
+def test_phi_runs_smoothly_over_the_edge_of_the_shadow(wall: ContainerOcclusion) -> None:
     fields = signed_distance_fields(BallBehindAWall(), 64, container=wall)
     inside = np.linalg.norm(nodes(fields.grid), axis=-1) < 0.6 * RADIUS
     phi = fields.phi[0]
@@ -166,12 +166,12 @@ def test_phi_runs_smoothly_over_the_edge_of_the_shadow(wall: ContainerShadow) ->
 
 def test_nothing_is_liquid_in_a_wall_or_below_the_foot() -> None:
     scene = BallBehindAWall()
-    plate = ContainerShadow(box((-1, -0.1, -1), (1, 0.0, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
+    plate = ContainerOcclusion(box((-1, -0.1, -1), (1, 0.0, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
     fields = signed_distance_fields(scene, 48, container=plate)
     y = nodes(fields.grid)[..., 1]
     assert (fields.phi[0][y < -1e-6] > 0).all()
     assert (fields.phi[0] < 0).any()
-    floor = ContainerShadow(box((-1, 0.1, -1), (1, 0.2, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
+    floor = ContainerOcclusion(box((-1, 0.1, -1), (1, 0.2, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
     assert sequence_bounds(scene, floor).low[1] == pytest.approx(0.1, abs=0.01)
 
 
@@ -181,7 +181,7 @@ def test_two_views_must_see_a_point() -> None:
 
     def seen(*walls: tuple) -> bool:
         shape = trimesh.util.concatenate([trimesh.creation.box(bounds=wall) for wall in walls])
-        outside = CarvingContainer(ContainerShadow(mesh_of(shape)), Silhouettes(scene), grid).outside
+        outside = CarvingOcclusion(ContainerOcclusion(mesh_of(shape)), Silhouettes(scene), grid).outside
         assert (outside > 0).all() or (outside < 0).all()
         return bool((outside < 0).all())
 
@@ -190,7 +190,7 @@ def test_two_views_must_see_a_point() -> None:
     assert not seen(right, front)  # from camera 4 alone
 
 
-def test_carving_around_a_container_does_not_depend_on_threads(wall: ContainerShadow, monkeypatch) -> None:
+def test_carving_around_a_container_does_not_depend_on_threads(wall: ContainerOcclusion, monkeypatch) -> None:
     from splashbench import parallel
 
     shared = signed_distance_fields(BallBehindAWall(), 40, container=wall)
@@ -199,7 +199,7 @@ def test_carving_around_a_container_does_not_depend_on_threads(wall: ContainerSh
 
 
 def test_a_container_out_of_sight_changes_nothing() -> None:
-    far = ContainerShadow(box((50, 50, 50), (51, 51, 51)))
+    far = ContainerOcclusion(box((50, 50, 50), (51, 51, 51)))
     scene = BallBehindAWall()
     np.testing.assert_array_equal(
         signed_distance_fields(scene, 24, container=far).phi, signed_distance_fields(scene, 24).phi

@@ -10,7 +10,7 @@ import pytest
 from splashbench import toml
 from splashbench.cli.main import main
 
-FEW_STEPS = ["--set", "iterations=10", "--set", "anchors=200", "--set", "longest_side=32"]
+FEW_STEPS = ["--set", "iterations=10", "--set", "max_anchors=200", "--set", "longest_side=32"]
 
 
 def _json(capsys: pytest.CaptureFixture[str], *words: object) -> Any:

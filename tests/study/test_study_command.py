@@ -152,7 +152,7 @@ def test_dpsnr_is_measured_against_nothing_on_the_same_scene(balls_directory: Pa
     changes = {
         "seeds": [4],
         "metrics": ["psnr", "dpsnr_bg"],
-        "reference": {"settings": {"iterations": 1, "anchors": 50, "longest_side": 32}},
+        "reference": {"settings": {"iterations": 1, "max_anchors": 50, "longest_side": 32}},
         "variants": [{"name": "full"}],
     }
     path, out = _write(tmp_path, _spec(balls_directory, **changes)), tmp_path / "out"

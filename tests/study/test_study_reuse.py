@@ -71,7 +71,7 @@ def test_a_part_that_no_seed_changes_is_shared_by_all_seeds(balls: Scene, tmp_pa
 
 
 def test_a_shared_background_renders_to_the_same_bytes(balls: Scene, tmp_path: Path) -> None:
-    settings = BackgroundSettings(iterations=3, anchors=200, longest_side=48)
+    settings = BackgroundSettings(iterations=3, max_anchors=200, longest_side=48)
     alone = fit_background(balls.training(), settings, Run(seed=1))
     fitted = shared_background(balls.training(), settings, Run(seed=1, cache=tmp_path))
     run = Run(seed=1, cache=tmp_path)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ..carriers.subframe import CarrierState
 from ..kernel.decode import Heads, Instant, decode
 from . import losses
 
@@ -29,7 +30,7 @@ class DecoderSettings:
 
     feature_size: int = 32
     children: int = 2
-    colour_width: int = 64
+    color_width: int = 64
     offset_bound: float = 1.0
     scale_range: float = 0.5
     opacity_slope: float = 2.0
@@ -38,33 +39,19 @@ class DecoderSettings:
 
 
 @dataclass
-class CarrierState:
-    """What the decoder needs of n active carriers at one instant.
-
-    positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels. visibility: [n] in [0, 1], by
-    which opacities are multiplied where the carriers are hidden from the view at hand; all are seen by default.
-    """
-
-    positions: Tensor
-    deformation: Tensor
-    phi: Tensor
-    visibility: Tensor | None = None
-
-
-@dataclass
 class Children:
     """n carriers' K children: means [n, K, 3], factors [n, K, 3, 3] of their covariances B B^T (scene units), opacities
-    [n, K], colours [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units."""
+    [n, K], colors [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units."""
 
     means: Tensor
     factors: Tensor
     opacities: Tensor
-    colours: Tensor
+    colors: Tensor
     offsets: Tensor
 
 
 @dataclass
-class ColourCells:
+class ColorCells:
     """Cells of space whose carriers should agree in colour.
 
     of_carriers: int64 [n], numbered from 0 without gaps. sizes: float [cells], carriers in each.
@@ -77,19 +64,19 @@ class ColourCells:
 @dataclass
 class Penalties:
     """What the objective says of the children themselves, scalars: `losses.covariance_loss` in squared scene units,
-    `separation_loss` and `colour_loss`."""
+    `separation_loss` and `color_loss`."""
 
     covariance: Tensor
     separation: Tensor
-    colour: Tensor
+    color: Tensor
 
 
-def penalties(children: Children, cells: ColourCells) -> Penalties:
+def penalties(children: Children, cells: ColorCells) -> Penalties:
     """The penalties on children, in plain torch."""
     return Penalties(
         losses.covariance_loss(children.factors, voxel=1.0),
         losses.separation_loss(children.offsets),
-        losses.colour_loss(children.colours, cells.of_carriers, cells.sizes),
+        losses.color_loss(children.colors, cells.of_carriers, cells.sizes),
     )
 
 
@@ -103,8 +90,8 @@ class Decoder(nn.Module):
         self.offset = nn.Linear(size, 3 * k)
         self.scale = nn.Linear(size, 3 * k)
         self.opacity = nn.Linear(size, k)
-        self.colour_hidden = nn.Linear(size + 3, settings.colour_width)
-        self.colour_out = nn.Linear(settings.colour_width, 3 * k)
+        self.color_hidden = nn.Linear(size + 3, settings.color_width)
+        self.color_out = nn.Linear(settings.color_width, 3 * k)
         with torch.no_grad():
             for head in (self.offset, self.scale, self.opacity):
                 head.weight.mul_(0.3)  # children start alike, near the values the biases give
@@ -140,9 +127,9 @@ class Decoder(nn.Module):
             fade = fade * state.visibility
         opacities = torch.sigmoid(self.opacity(features)) * fade[:, None]
         direction = nn.functional.normalize(state.positions - eye, dim=1)
-        hidden = torch.relu(self.colour_hidden(torch.cat([features, direction], dim=1)))
-        colours = torch.sigmoid(self.colour_out(hidden)).view(n, k, 3)
-        return Children(means, factors, opacities, colours, offsets)
+        hidden = torch.relu(self.color_hidden(torch.cat([features, direction], dim=1)))
+        colors = torch.sigmoid(self.color_out(hidden)).view(n, k, 3)
+        return Children(means, factors, opacities, colors, offsets)
 
     def decode(
         self,
@@ -151,7 +138,7 @@ class Decoder(nn.Module):
         rows: Tensor | None,
         state: CarrierState,
         eye: Tensor,
-        cells: ColourCells | None = None,
+        cells: ColorCells | None = None,
     ) -> tuple[Children, Penalties | None]:
         """Children of the carriers `rows` (int64 [n], ascending; None for all) of the tables, as `forward` has them,
         and with `cells` also the penalties on them. With `rows` the gradients of the tables are sparse."""
@@ -173,8 +160,8 @@ class Decoder(nn.Module):
             offset=(self.offset.weight, self.offset.bias),
             scale=(self.scale.weight, self.scale.bias),
             opacity=(self.opacity.weight, self.opacity.bias),
-            hidden=(self.colour_hidden.weight, self.colour_hidden.bias),
-            color=(self.colour_out.weight, self.colour_out.bias),
+            hidden=(self.color_hidden.weight, self.color_hidden.bias),
+            color=(self.color_out.weight, self.color_out.bias),
             offset_bound=s.offset_bound,
             scale_range=s.scale_range,
             opacity_slope=s.opacity_slope,

@@ -1,8 +1,7 @@
 """Optimising features, base scales and heads by rendering (paper, "Optimization").
 
 Each iteration takes one time-camera pair, decodes the carriers active then, rasterises them over the frozen
-background and descends on the seven losses. Carriers' positions and deformations are given (carriers.py) and stay as
-they are.
+background and descends on the seven losses. Positions and deformations are given (carriers/) and stay as they are.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from splashbench.errors import SplashbenchError
 from splashbench.render import rasterize
 from splashbench.scene.camera import Camera
 
+from ..carriers.subframe import Track
 from ..kernel.window_loss import window_losses
-from ..subframe import Track
 from . import losses
-from .decoder import Children, ColourCells, Decoder, DecoderSettings, Penalties, initial_log_scale
+from .decoder import Children, ColorCells, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .optimizer import RowAdam
 from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
 from .shared_features import SharedFeatures
-from .targets import Target
+from .targets import TrainingTarget
 
 # Iterations between two looks at the withheld photographs.
 _LOOK_EVERY = 100
@@ -39,17 +38,17 @@ class FitSettings:
     """Settings of the optimisation.
 
     iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
-    anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. withheld_share: of the
+    anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. validation_share: of the
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
-    `AdaptiveSchedule`. shared_cells: see `SharedFeatures`; learning_rate_shared is that of the shared parts.
+    `AdaptiveSchedule`. feature_cells: see `SharedFeatures`; learning_rate_cells is that of the shared parts.
     """
 
     iterations: int = 1000
-    withheld_share: float = 0.0
+    validation_share: float = 0.0
     stop_gain: float = 0.01
     learning_rate_features: float = 0.06
-    learning_rate_shared: float = 0.02
-    shared_cells: tuple[float, ...] = ()
+    learning_rate_cells: float = 0.02
+    feature_cells: tuple[float, ...] = ()
     learning_rate_heads: float = 0.015
     learning_rate_scales: float = 1e-2
     anneal: bool = True
@@ -86,14 +85,16 @@ def composite(children: Children, camera: Camera, background: Tensor) -> tuple[T
         children.means.flatten(0, 1),
         children.factors.flatten(0, 1),
         children.opacities.flatten(),
-        children.colours.flatten(0, 1),
+        children.colors.flatten(0, 1),
         camera,
         background=background,
     )
     return image, alpha
 
 
-def image_loss(image: Tensor, alpha: Tensor, target: Target, weights: losses.LossWeights, ssim_weight: float) -> Tensor:
+def image_loss(
+    image: Tensor, alpha: Tensor, target: TrainingTarget, weights: losses.LossWeights, ssim_weight: float
+) -> Tensor:
     """The weighted sum of the terms that compare images (Eq. total_loss); `ssim_weight` replaces weights.ssim."""
     foreground, gradient, silhouette = window_losses(image, alpha, target.photograph)
     loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / target.area
@@ -108,33 +109,33 @@ def penalty_loss(penalties: Penalties, voxel: float, weights: losses.LossWeights
     return (
         weights.covariance * penalties.covariance / voxel**2
         + weights.separation * penalties.separation
-        + weights.colour * penalties.colour
+        + weights.color * penalties.color
     )
 
 
-def _colour_cells(track: Track, t: int, size: float) -> ColourCells:
+def _color_cells(track: Track, t: int, size: float) -> ColorCells:
     """The cells of frame `t`'s carriers, of `size` transport voxels."""
     keys = np.floor(track.carriers.positions[track.carriers.rows(t)] / size).astype(np.int64)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    return ColourCells(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32)))
+    return ColorCells(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32)))
 
 
 def fit_appearance(
     appearance: Appearance,
     track: Track,
-    targets: list[Target],
+    targets: list[TrainingTarget],
     settings: FitSettings,
-    colour_cell: float,
+    color_cell: float,
     seed: int,
     progress: Callable[[float], None],
 ) -> list[float]:
-    """Fit `appearance` in place; the loss of every iteration is returned. `colour_cell`: in transport voxels.
+    """Fit `appearance` in place; the loss of every iteration is returned. `color_cell`: in transport voxels.
 
     Raises SplashbenchError where the loss stops being finite.
     """
     frames = range(track.carriers.n_frames)
     states, ids = [track.state(t) for t in frames], [track.ids(t) for t in frames]
-    cells = [_colour_cells(track, t, colour_cell) for t in frames]
+    cells = [_color_cells(track, t, color_cell) for t in frames]
     decoder = appearance.decoder
     parameters = list(decoder.parameters())
     heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
@@ -143,23 +144,23 @@ def fit_appearance(
         appearance.features,
         track.carriers,
         ids,
-        settings.shared_cells,
+        settings.feature_cells,
         settings.learning_rate_features,
-        settings.learning_rate_shared,
+        settings.learning_rate_cells,
         seed,
     )
     rng = np.random.default_rng([seed, 1])
     held = np.zeros(len(targets), dtype=bool)
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
-    if settings.withheld_share > 0:
+    if settings.validation_share > 0:
         adaptive = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
         if adaptive.may_stop:
-            held = withheld(len(targets), settings.withheld_share, np.random.default_rng([seed, 3]))
+            held = withheld(len(targets), settings.validation_share, np.random.default_rng([seed, 3]))
         if held.any() or not adaptive.may_stop:
             schedule = adaptive
 
     def seen(
-        target: Target, frame_features: Tensor, frame_scales: Tensor, penalised: bool
+        target: TrainingTarget, frame_features: Tensor, frame_scales: Tensor, penalised: bool
     ) -> tuple[Tensor, Tensor, Penalties | None]:
         # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
         state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]

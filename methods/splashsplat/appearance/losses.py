@@ -27,7 +27,7 @@ class LossWeights:
     silhouette: float = 0.7
     covariance: float = 0.01
     separation: float = 0.1
-    colour: float = 1.0
+    color: float = 1.0
 
 
 def foreground_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
@@ -75,11 +75,11 @@ def separation_loss(offsets: Tensor) -> Tensor:
     return ((SEPARATION_MARGIN - distance).clamp_min(0) ** 2).mean()
 
 
-def colour_loss(colours: Tensor, cells: Tensor, cell_sizes: Tensor) -> Tensor:
+def color_loss(colors: Tensor, cells: Tensor, cell_sizes: Tensor) -> Tensor:
     """Variance of colour [n, K, 3] within grid cells (Eq. col_loss).
 
     cells: int64 [n], numbered from 0 without gaps; cell_sizes: float [cells], carriers in each.
     """
-    sums = colours.new_zeros(len(cell_sizes), 3).index_add_(0, cells, colours.mean(dim=1))
+    sums = colors.new_zeros(len(cell_sizes), 3).index_add_(0, cells, colors.mean(dim=1))
     means = sums / cell_sizes[:, None]
-    return ((colours - means.index_select(0, cells)[:, None]) ** 2).mean()
+    return ((colors - means.index_select(0, cells)[:, None]) ** 2).mean()

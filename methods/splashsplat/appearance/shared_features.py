@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..carriers.tracking import Carriers
+from ..carriers.population import Carriers
 from .optimizer import RowAdam
 
 
 @dataclass(frozen=True)
-class _Level:
+class _FeatureLevel:
     """Cells of one size. cells: int64 [count] of all carriers. table: [cells, width], what each cell adds. rows,
     members: per frame the cells of its carriers, ascending, and which of these each carrier is in."""
 
@@ -51,7 +51,7 @@ class SharedFeatures:
     ) -> None:
         self._own, self._adam = own, RowAdam(own, own_rate)
         self._ids = ids
-        self._levels: list[_Level] = []
+        self._levels: list[_FeatureLevel] = []
         if not sizes:
             return
         born = births(carriers)
@@ -62,7 +62,7 @@ class SharedFeatures:
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
             found = [torch.unique(cells.index_select(0, ids), return_inverse=True) for ids in self._ids]
             rows, members = [rows for rows, _ in found], [members for _, members in found]
-            self._levels.append(_Level(cells, table, RowAdam(table, shared_rate), rows, members))
+            self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), rows, members))
 
     def of_frame(self, t: int) -> Tensor:
         """Features of the carriers of frame `t`, [n, width]."""

@@ -18,8 +18,8 @@ from torch import Tensor
 from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
+from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import Photograph
-from ..subframe import Track, locate
 
 MASK_MARGIN = 8
 # A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
@@ -27,7 +27,7 @@ SAME_TIME = 0.01
 
 
 @dataclass
-class Target:
+class TrainingTarget:
     """One time-camera pair.
 
     frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
@@ -87,7 +87,7 @@ def collect_targets(
     camera_times: bool = False,
     trusted: np.ndarray | None = None,
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
-) -> list[Target]:
+) -> list[TrainingTarget]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
     backgrounds: float32 [H, W, 3] of each training view. camera_times: whether a photograph shows the liquid at its
@@ -124,7 +124,7 @@ def collect_targets(
                 left=box[0] - x0,
             )
             targets.append(
-                Target(
+                TrainingTarget(
                     frame=frame,
                     fraction=fraction,
                     camera=camera.cropped(x0, y0, x1 - x0, y1 - y0),

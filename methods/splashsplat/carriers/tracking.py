@@ -7,7 +7,7 @@ sank below the shell are dropped. A third, by choice, keeps appearance up to dat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -16,11 +16,12 @@ import numpy as np
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 
-from ..motion.step import Motion
+from ..motion.steps import FrameStep
+from .correction import correct
+from .population import Carriers
 from .resampling import ShellSettings, cell_of, newborns, within_capacity
-from .transport import correct
 
-Variant = Literal["full", "no_resampling", "per_frame", "flip"]
+TrackingVariant = Literal["full", "no_resampling", "per_frame", "flip"]
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,10 @@ class CarrierSettings:
     place and has its own appearance to learn: what a carrier shows, and whether it is of the liquid at all or of the
     phantom volume of the hull, changes within a few frames. `variant` picks the paper's ablations; "full" is the
     method. "no_resampling": carriers of the first liquid only. "per_frame": new ones in every frame, none moved.
-    "flip": carriers of the first liquid, moved by a simulation that looks at no other frame (flip.py).
+    "flip": carriers of the first liquid, moved by a simulation that looks at no other frame (flip/).
     """
 
-    variant: Variant = "full"
+    variant: TrackingVariant = "full"
     correction: float = 1.0
     kill_outside: float = 0.5
     kill_inside: float | None = -3.0
@@ -46,129 +47,111 @@ class CarrierSettings:
 class Simulation(Protocol):
     """Moves carriers by itself from where it was started."""
 
-    def forecast(self, ids: np.ndarray, deformation: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [N, 3] and F [N, 3, 3] of the carriers `ids` after the frame step number `step`."""
+    def forecast(
+        self, ids: np.ndarray, deformation: np.ndarray, number: int, observed: FrameStep
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [N, 3] and F [N, 3, 3] of the carriers `ids` after the frame step `number`, counted from 0.
+
+        observed: the motion that was fitted to that step.
+        """
         ...
 
 
-@dataclass
-class Carriers:
-    """All carriers of a sequence, frame by frame.
+@dataclass(frozen=True)
+class Tracking:
+    """What the loop needs besides the frames.
 
-    starts: int64 [T + 1]; the rows of frame t are starts[t]:starts[t + 1] of the arrays below. ids: int32 [R] carrier
-    of each row, ascending within a frame. positions: float32 [R, 3] transport-grid coordinates. deformation: float32
-    [R, 3, 3], F. phi: float32 [R] at the carrier, transport voxels. count: number of carriers in all.
+    hull_grid: of phi_t. grid: the transport grid, of carriers and motion. seen: given phi_t and hull-grid coordinates
+    [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. landed: given t, where
+    carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3]. simulation: makes
+    one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
     """
 
-    starts: np.ndarray
-    ids: np.ndarray
-    positions: np.ndarray
-    deformation: np.ndarray
-    phi: np.ndarray
-    count: int
-
-    @property
-    def n_frames(self) -> int:
-        return len(self.starts) - 1
-
-    def rows(self, t: int) -> slice:
-        """Rows of the carriers active in frame `t`."""
-        return slice(int(self.starts[t]), int(self.starts[t + 1]))
-
-    def births_and_ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """First and last active frame of every carrier, int32 [count] each (b_i and e_i of Eq. carrier_union)."""
-        frame = np.repeat(np.arange(self.n_frames, dtype=np.int32), np.diff(self.starts))
-        births = np.full(self.count, self.n_frames, dtype=np.int32)
-        ends = np.full(self.count, -1, dtype=np.int32)
-        np.minimum.at(births, self.ids, frame)
-        np.maximum.at(ends, self.ids, frame)
-        return births, ends
-
-    def keep(self, wanted: np.ndarray) -> tuple[Carriers, np.ndarray]:
-        """Only the carriers with `wanted` (bool [count]), renumbered; and the old number of each, int64."""
-        old = np.nonzero(wanted)[0]
-        new = np.full(self.count, -1, dtype=np.int32)
-        new[old] = np.arange(len(old), dtype=np.int32)
-        rows = wanted[self.ids]
-        frame = np.repeat(np.arange(self.n_frames), np.diff(self.starts))
-        counts = np.bincount(frame[rows], minlength=self.n_frames)
-        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        kept = Carriers(
-            starts,
-            new[self.ids[rows]],
-            self.positions[rows],
-            self.deformation[rows],
-            self.phi[rows],
-            len(old),
-        )
-        return kept, old
+    hull_grid: Grid
+    grid: Grid
+    settings: CarrierSettings
+    seed: int
+    seen: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    landed: Callable[[int, np.ndarray, np.ndarray], np.ndarray] | None = None
+    simulation: Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation] | None = None
 
 
-def track_carriers(
-    fields: Iterable[np.ndarray],
-    hull_grid: Grid,
-    grid: Grid,
-    motion: Motion,
-    settings: CarrierSettings,
-    seed: int,
-    seen: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-    landed: Callable[[int, np.ndarray, np.ndarray], np.ndarray] | None = None,
-    simulation: Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation] | None = None,
-) -> Carriers:
-    """Run the loop over all frames.
+class CarrierTracker:
+    """The loop: `advance` by one frame after another, then `carriers`."""
 
-    fields: phi_t on `hull_grid`, one frame after another, in transport voxels. grid: the transport grid. motion: its
-    step t - 1 is asked for once phi_t has come. seen: given phi_t and hull-grid
-    coordinates [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. landed: given
-    t, where carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3].
-    simulation: makes one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
-    """
-    ratio = np.float32(grid.voxel / hull_grid.voxel)
-    ids = np.zeros(0, dtype=np.int32)
-    x = np.zeros((0, 3), dtype=np.float32)
-    F = np.zeros((0, 3, 3), dtype=np.float32)
-    lasts = np.zeros(0, dtype=np.int64)  # of every carrier so far, the last frame it may see
-    born = 0
-    simulated: Simulation | None = None
-    frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-    for t, phi in enumerate(fields):
-        if settings.variant == "per_frame":
-            ids, x, F = ids[:0], x[:0], F[:0]
-        elif simulated is not None:
-            x, F = simulated.forecast(ids, F, t - 1)
-            inside = sample(phi, x * ratio) <= settings.kill_outside
-            ids, x, F = ids[inside], x[inside], F[inside]
-        elif t > 0 and len(ids):
-            start = x
-            x, F = motion.step(t - 1).forecast(x, F)
-            if landed is not None:
-                x = landed(t, start, x)
-            x = correct(phi, x, float(ratio), settings.correction)
-            alive = _alive(phi, x, ratio, settings) & (lasts[ids] >= t)
-            if settings.cell_capacity is not None:
-                alive[alive] = within_capacity(cell_of(x[alive], grid), ids[alive], settings.cell_capacity)
-            ids, x, F = ids[alive], x[alive], F[alive]
+    def __init__(self, tracking: Tracking) -> None:
+        self._tracking, self._settings = tracking, tracking.settings
+        self._ratio = np.float32(tracking.grid.voxel / tracking.hull_grid.voxel)
+        self._ids = np.zeros(0, dtype=np.int32)
+        self._x = np.zeros((0, 3), dtype=np.float32)
+        self._F = np.zeros((0, 3, 3), dtype=np.float32)
+        # Of every carrier so far, the last frame that it may see.
+        self._last_frames = np.zeros(0, dtype=np.int64)
+        self._simulation: Simulation | None = None
+        self._frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def advance(self, phi: np.ndarray, step: FrameStep | None) -> None:
+        """To the next frame.
+
+        phi: phi_t on the hull grid, transport voxels. step: the motion since the frame before; None in the first frame.
+        """
+        t = len(self._frames)
+        if self._settings.variant == "per_frame":
+            self._keep(slice(0))
+        elif step is not None and self._simulation is not None:
+            self._x, self._F = self._simulation.forecast(self._ids, self._F, t - 1, step)
+            self._keep(sample(phi, self._x * self._ratio) <= self._settings.kill_outside)
+        elif step is not None and len(self._ids):
+            self._forecast(t, phi, step)
         # Without resampling, the first frame that shows liquid is the only one that gives carriers.
-        if settings.variant not in ("no_resampling", "flip") or born == 0:
-            new = newborns(phi, grid, float(ratio), x, settings.shell, np.random.default_rng([seed, t]))
-            if seen is not None:
-                new = new[seen(phi, new * ratio)]
-            ids = np.concatenate([ids, np.arange(born, born + len(new), dtype=np.int32)])
-            x = np.concatenate([x, new])
-            F = np.concatenate([F, np.broadcast_to(np.eye(3, dtype=np.float32), (len(new), 3, 3))])
-            lasts = np.concatenate([lasts, t + _ages(len(new), settings.lifetime, np.random.default_rng([seed, t, 1]))])
-            born += len(new)
-            if simulation is not None and settings.variant == "flip" and born:
-                simulated = simulation(phi, ids, x)
-        frames.append((ids, x, F, sample(phi, x * ratio)))
-    starts = np.concatenate([[0], np.cumsum([len(frame[0]) for frame in frames])]).astype(np.int64)
-    all_ids, positions, deformation, depth = (np.concatenate(column) for column in zip(*frames))
-    return Carriers(starts, all_ids, positions, deformation, depth, born)
+        born = len(self._last_frames)
+        if self._settings.variant not in ("no_resampling", "flip") or born == 0:
+            self._resample(t, phi, born)
+        self._frames.append((self._ids, self._x, self._F, sample(phi, self._x * self._ratio)))
+
+    def carriers(self) -> Carriers:
+        """The carriers of all frames so far."""
+        starts = np.concatenate([[0], np.cumsum([len(ids) for ids, *_ in self._frames])]).astype(np.int64)
+        ids, positions, deformation, phi = (np.concatenate(column) for column in zip(*self._frames))
+        return Carriers(starts, ids, positions, deformation, phi, len(self._last_frames))
+
+    def _forecast(self, t: int, phi: np.ndarray, step: FrameStep) -> None:
+        """Forecast, correct, and drop what left the liquid, outlived its time or crowds a cell."""
+        start, settings = self._x, self._settings
+        self._x, self._F = step.forecast(start, self._F)
+        if self._tracking.landed is not None:
+            self._x = self._tracking.landed(t, start, self._x)
+        x = self._x = correct(phi, self._x, float(self._ratio), settings.correction)
+        alive = _alive(phi, x, self._ratio, settings) & (self._last_frames[self._ids] >= t)
+        if settings.cell_capacity is not None:
+            cells = cell_of(x[alive], self._tracking.grid)
+            alive[alive] = within_capacity(cells, self._ids[alive], settings.cell_capacity)
+        self._keep(alive)
+
+    def _resample(self, t: int, phi: np.ndarray, born: int) -> None:
+        """New carriers where the shell of phi_t is short of them, numbered from `born`."""
+        tracking, settings = self._tracking, self._settings
+        rng = np.random.default_rng([tracking.seed, t])
+        new = newborns(phi, tracking.grid, float(self._ratio), self._x, settings.shell, rng)
+        if tracking.seen is not None:
+            new = new[tracking.seen(phi, new * self._ratio)]
+        self._ids = np.concatenate([self._ids, np.arange(born, born + len(new), dtype=np.int32)])
+        self._x = np.concatenate([self._x, new])
+        self._F = np.concatenate([self._F, np.broadcast_to(np.eye(3, dtype=np.float32), (len(new), 3, 3))])
+        ages = _ages(len(new), settings.lifetime, np.random.default_rng([tracking.seed, t, 1]))
+        self._last_frames = np.concatenate([self._last_frames, t + ages])
+        if tracking.simulation is not None and settings.variant == "flip" and len(self._last_frames):
+            self._simulation = tracking.simulation(phi, self._ids, self._x)
+
+    def _keep(self, chosen: np.ndarray | slice) -> None:
+        self._ids, self._x, self._F = self._ids[chosen], self._x[chosen], self._F[chosen]
 
 
 def _ages(count: int, lifetime: int | None, rng: np.random.Generator) -> np.ndarray:
-    """How many frames after its first each of `count` new carriers may last, int64 [count]; spread, so that those of
-    one frame do not all go in one frame."""
+    """How many frames after its first each of `count` new carriers may last, int64 [count].
+
+    Spread, so that those of one frame do not all go in one frame.
+    """
     if lifetime is None:
         return np.full(count, np.iinfo(np.int32).max, dtype=np.int64)
     return rng.integers(0, 2 * lifetime - 1, count)

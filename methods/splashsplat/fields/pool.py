@@ -17,25 +17,19 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.ndimage import binary_fill_holes
 
-from splashbench.observe.container import solid_distance
-from splashbench.observe.grid import Bounds, Grid
-from splashbench.observe.kernels import sample, trilinear
+from splashbench.observe.grid import Grid
 from splashbench.observe.occlusion import focal_length
 from splashbench.observe.silhouettes import Silhouettes, signed_distance_2d
 from splashbench.parallel import over_range
 from splashbench.scene.camera import Camera
-from splashbench.scene.container import ContainerMesh
 
-from ..motion.ballistic import Jet
+from .jet import Jet
+from .vessel import Vessel, lowest_heights
 
-VESSEL_CELLS = 96
 # Levels are tried this far apart, in vessel voxels; a pool explains the masks where they overlap by at least this.
 _LEVEL_STEP = 0.25
 _MIN_OVERLAP = 0.35
-# Nodes of a slice that walls must enclose for it to hold anything.
-_SMALLEST_ROOM = 4
 # Voxels about the surface within which distances matter.
 _NEAR = 3.0
 _SMALL_LOOP = 4096
@@ -43,127 +37,6 @@ _SMALL_LOOP = 4096
 _STEADY = 2
 # Views of larger liquid windows are looked at every so many pixels, so that this many remain along the longest side.
 _LONGEST_WINDOW = 480
-
-
-def upright(gravity: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] from scene axes to axes whose third points up, against `gravity` (unit vector)."""
-    up = -np.asarray(gravity, dtype=np.float64)
-    side = np.eye(3)[int(np.argmin(np.abs(up)))]
-    first = np.cross(side, up)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(up, first), up])
-
-
-@dataclass(frozen=True)
-class Vessel:
-    """Where a container can hold liquid.
-
-    turn: [3, 3] scene axes to upright ones. grid: over the container, upright axes, scene units. solid: float32, signed
-    distance to the walls in voxels, negative in them. inside: float32 of 0 and 1, free space that walls enclose
-    sideways. rim: greatest height of it, scene units.
-    """
-
-    turn: np.ndarray
-    grid: Grid
-    solid: np.ndarray
-    inside: np.ndarray
-    rim: float
-
-    @classmethod
-    def of(cls, mesh: ContainerMesh, gravity: np.ndarray, cells: int = VESSEL_CELLS) -> Vessel | None:
-        """The vessel that `mesh` is, or None where it encloses nothing (a plate, a mesh with holes)."""
-        turn = upright(gravity)
-        vertices = mesh.vertices @ turn.T
-        bounds = Bounds(vertices.min(axis=0), vertices.max(axis=0)).padded(0.08)
-        grid = Grid.over(bounds, cells)
-        solid = solid_distance(ContainerMesh(vertices, mesh.faces), grid)
-        wall = solid < 0.5  # half a voxel thicker, so that a thin wall has no holes between the nodes
-        inside = np.zeros(grid.shape, dtype=np.float32)
-        for k in range(grid.shape[2]):
-            filled = binary_fill_holes(wall[:, :, k])
-            if (filled & ~wall[:, :, k]).sum() >= _SMALLEST_ROOM:
-                inside[:, :, k] = filled & (solid[:, :, k] > 0)
-        levels = np.nonzero(inside.any(axis=(0, 1)))[0]
-        if len(levels) == 0:
-            return None
-        return cls(turn, grid, solid, inside, float(grid.origin[2] + grid.voxel * levels[-1]))
-
-    def height(self, points: np.ndarray) -> np.ndarray:
-        """Height of `points` [..., 3] (scene units), scene units above the scene's origin."""
-        return np.asarray(points) @ self.turn[2]
-
-    def room(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance of `points` [N, 3] (scene units) to the wall from within: float32 [N], scene units, negative
-        where the vessel can hold liquid, large elsewhere."""
-        nodes = self.grid.to_voxels(points @ self.turn.T)
-        beyond = np.abs(nodes - np.clip(nodes, 0, np.array(self.grid.shape) - 1)).max(axis=1) > 0
-        distance = -sample(self.solid, nodes)
-        enclosed = (sample(self.inside, nodes) > 0.25) | (distance > 0)
-        return np.where(enclosed & ~beyond, distance, 20).astype(np.float32) * np.float32(self.grid.voxel)
-
-    def walled(self, points: np.ndarray) -> np.ndarray:
-        """bool [N]: whether `points` [N, 3] (scene units) lie in the container's walls."""
-        return sample(self.solid, self.grid.to_voxels(points @ self.turn.T)) < 0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lowest(
-    solid: np.ndarray,
-    inside: np.ndarray,
-    ray: np.ndarray,
-    eye: np.ndarray,
-    corner: np.ndarray,
-    stride: int,
-    opaque: bool,
-    heights: np.ndarray,
-    start: int,
-    stop: int,
-) -> None:
-    nx, ny, nz = solid.shape
-    top = np.array([nx - 1.0, ny - 1.0, nz - 1.0])
-    for row in range(start, stop):
-        v = corner[1] + row * stride + 0.5
-        for column in range(heights.shape[1]):
-            u = corner[0] + column * stride + 0.5
-            direction = ray[:, 0] * u + ray[:, 1] * v + ray[:, 2]
-            direction /= np.sqrt((direction**2).sum())
-            near, far = 0.0, 1e9
-            for axis in range(3):
-                if abs(direction[axis]) > 1e-12:
-                    a = -eye[axis] / direction[axis]
-                    b = (top[axis] - eye[axis]) / direction[axis]
-                    near, far = max(near, min(a, b)), min(far, max(a, b))
-                elif eye[axis] < 0 or eye[axis] > top[axis]:
-                    far = -1.0
-            lowest = np.inf
-            s = near
-            while s <= far:
-                x = eye[0] + s * direction[0]
-                y = eye[1] + s * direction[1]
-                z = eye[2] + s * direction[2]
-                if opaque and trilinear(solid, x, y, z) < 0:
-                    break
-                if inside[int(x + 0.5), int(y + 0.5), int(z + 0.5)] > 0:
-                    lowest = min(lowest, z)
-                s += 0.5
-            heights[row, column] = lowest
-
-
-def lowest_heights(
-    vessel: Vessel, camera: Camera, corner: np.ndarray, shape: tuple[int, int], stride: int, opaque: bool
-) -> np.ndarray:
-    """How deep each pixel looks into the vessel: float32 `shape`, scene units of height, inf where it does not.
-
-    Pixels are `stride` apart from `corner` (x, y). A pool covers a pixel when its level is above that height.
-    """
-    grid = vessel.grid
-    ray = vessel.turn @ camera.w2c[:3, :3].T @ np.linalg.inv(camera.K)
-    eye = (vessel.turn @ camera.center - grid.origin) / grid.voxel
-    heights = np.empty(shape, dtype=np.float32)
-    over_range(
-        _lowest, shape[0], vessel.solid, vessel.inside, ray, eye, corner.astype(np.float64), stride, opaque, heights
-    )
-    return (heights * np.float32(grid.voxel) + np.float32(grid.origin[2])).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -229,14 +102,14 @@ class Pool:
         phi: np.ndarray,
         grid: Grid,
         level: float,
-        shadows: Sequence[np.ndarray | None],
+        container_depths: Sequence[np.ndarray | None],
         jet: Jet | None = None,
     ) -> np.ndarray:
         """`phi` (hull distance on `grid`, voxels) with a full pool up to `level` and without what every view explains
         by it: float32 of the same shape.
 
-        shadows: per view the container's depth image, None where it hides nothing (observe/container.py). jet: what
-        falls into the pool is no phantom.
+        container_depths: per view the container's depth image, None where it hides nothing (observe/container.py).
+        jet: what falls into the pool is no phantom.
         """
         if self._room is None or self._room.grid is not grid:
             self._room = _Room.of(self.vessel, grid)
@@ -250,7 +123,7 @@ class Pool:
         doubtful, points, removal = doubtful[high], points[high], above[high]
         if jet is not None:
             removal = np.minimum(removal, jet.distance(points @ self.vessel.turn.T).astype(np.float32) / grid.voxel - 1)
-        for view, shadow in zip(self.views, shadows):
+        for view, container_depth in zip(self.views, container_depths):
             explained = signed_distance_2d(view.heights <= level) * np.float32(view.stride)
             fixed = (
                 points,
@@ -259,7 +132,7 @@ class Pool:
                 explained,
                 view.corner,
                 view.stride,
-                np.zeros((0, 0), np.float32) if shadow is None else shadow,
+                np.zeros((0, 0), np.float32) if container_depth is None else container_depth,
                 grid.voxel,
             )
             over_range(_phantom_depth, len(points), *fixed, removal, smallest=_SMALL_LOOP)
@@ -305,7 +178,7 @@ def _phantom_depth(
     explained: np.ndarray,
     corner: np.ndarray,
     stride: int,
-    shadow: np.ndarray,
+    container_depth: np.ndarray,
     tolerance: float,
     phantom: np.ndarray,
     start: int,
@@ -320,8 +193,9 @@ def _phantom_depth(
             continue
         u = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
         v = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
-        within = shadow.shape[0] > 0 and 0 <= u < shadow.shape[1] and 0 <= v < shadow.shape[0]
-        if within and depth > shadow[int(v), int(u)] + tolerance:
+        rows, columns = container_depth.shape
+        within = rows > 0 and 0 <= u < columns and 0 <= v < rows
+        if within and depth > container_depth[int(v), int(u)] + tolerance:
             continue
         a = min(max((u - 0.5 - corner[0]) / stride, 0.0), width - 1.0)
         b = min(max((v - 0.5 - corner[1]) / stride, 0.0), height - 1.0)

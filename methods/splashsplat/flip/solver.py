@@ -1,5 +1,5 @@
 """FLIP: liquid simulated from one observed state on, the paper's ablation "FLIP" ("Ablation Study"; supplement,
-"One-Step Solver Comparison").
+"One-FrameStep Solver Comparison").
 
 A FLIP/PIC solver (Zhu and Bridson 2005) with gravity, the container's walls and a free surface, and nothing that the
 images do not show: no inflow, no viscosity, no surface tension. A step is kick, drift, kick: half of gravity and a
@@ -19,12 +19,12 @@ from splashbench.observe.kernels import resample, sample
 from splashbench.parallel import over_range
 from splashbench.scene.scene import Scene, TrainingScene
 
-from ..carriers.transport import clamp_stretch
-from ..motion.step import Step
+from ..fields.jet import STANDARD_GRAVITY
+from ..motion.advection import clamp_stretch
+from ..motion.steps import FrameStep
 from .grid import drift, extrapolate, open_shares, slide, to_faces, to_particles
 from .pressure import apply_pressure, assemble, divergence, number_cells, solve
 
-STANDARD_GRAVITY = 9.81  # m/s^2
 # Faces beyond the liquid that get a velocity: a particle moves at most one cell, and gradients look one cell around.
 _LAYERS = 4
 _FAR = 1e3
@@ -239,7 +239,7 @@ class FlipTransport:
         self._velocities: np.ndarray | None = None
 
     def forecast(
-        self, ids: np.ndarray, deformation: np.ndarray, dt: float, observed: Step
+        self, ids: np.ndarray, deformation: np.ndarray, dt: float, observed: FrameStep
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions [N, 3] and F [N, 3, 3], float32, of the carriers `ids` after the next frame step of `dt` seconds.
 

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from splashbench.observe.kernels import sample
 
-from ..carriers.transport import forecast
+from .advection import forecast
 
 # A fit that takes the liquid's nodes so much farther outside, on average, is not believed (voxels). Of a slow surface
 # the fit shows no gain, and yet is right: most nodes near it are inside before and after.

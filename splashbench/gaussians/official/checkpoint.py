@@ -1,7 +1,7 @@
 """Weights that a stranger's code saved with PyTorch, read without running what is in the file.
 
-A `state_dict` goes through torch.load with weights_only=True, a TorchScript archive through traced.py. Shapes are held
-against those of the network before the numbers are used.
+A `state_dict` goes through torch.load with weights_only=True, a TorchScript archive through torchscript.py. Shapes are
+held against those of the network before the numbers are used.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import require_plain_file
-from splashbench.gaussians.official.traced import is_traced, traced_weights
+from splashbench.gaussians.official.torchscript import is_traced, traced_weights
 
 _MAX_BYTES = 256 << 20
 _KINDS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)

@@ -14,18 +14,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from splashbench.native.threads import use_threads
-from splashbench_methods.splashsplat.appearance.decoder import (
-    CarrierState,
-    ColourCells,
-    Decoder,
-    DecoderSettings,
-    penalties,
-)
+from splashbench_methods.splashsplat.appearance.decoder import ColorCells, Decoder, DecoderSettings, penalties
 from splashbench_methods.splashsplat.appearance.optimizer import TorchRowMoments
+from splashbench_methods.splashsplat.carriers.subframe import CarrierState
 from splashbench_methods.splashsplat.kernel.decode import Instant, decode
 from splashbench_methods.splashsplat.kernel.row_adam import RowMoments
 
-Case = tuple[Decoder, torch.Tensor, torch.Tensor, torch.Tensor, CarrierState, torch.Tensor, ColourCells]
+Case = tuple[Decoder, torch.Tensor, torch.Tensor, torch.Tensor, CarrierState, torch.Tensor, ColorCells]
 
 
 def case(n: int, seed: int = 0, hidden_from_view: bool = False, **sizes: int) -> Case:
@@ -42,7 +37,7 @@ def case(n: int, seed: int = 0, hidden_from_view: bool = False, **sizes: int) ->
     state = CarrierState(3 * torch.randn(n, 3), deformation, 4 * torch.randn(n), visibility)
     _, cells, counts = torch.unique(torch.randint(0, n // 3 + 1, (n,)), return_inverse=True, return_counts=True)
     features, log_scales = torch.randn(n + 3, decoder.settings.feature_size), torch.randn(n + 3, 3) - 2
-    return decoder, features, log_scales, rows, state, torch.tensor([1.0, -2, 3]), ColourCells(cells, counts.float())
+    return decoder, features, log_scales, rows, state, torch.tensor([1.0, -2, 3]), ColorCells(cells, counts.float())
 
 
 class PlainDecoder(Decoder):
@@ -100,13 +95,13 @@ def assert_same(got: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], p
         assert math.hypot(*own) <= limit, f"{layer} is off by {own}"
 
 
-@example(n=2, feature_size=24, children=1, colour_width=1, hidden_from_view=True, seed=163)  # terms cancel
+@example(n=2, feature_size=24, children=1, color_width=1, hidden_from_view=True, seed=163)  # terms cancel
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     n=st.sampled_from([0, 1, 2, 63, 64, 65, 130, 600]),
     feature_size=st.integers(1, 40),
     children=st.integers(1, 6),
-    colour_width=st.sampled_from([1, 5, 8, 33, 64]),
+    color_width=st.sampled_from([1, 5, 8, 33, 64]),
     hidden_from_view=st.booleans(),
     seed=st.integers(0, 1000),
 )
@@ -148,7 +143,7 @@ def test_what_is_not_a_number_stays_one():
     decoder, features, log_scales, rows, state, eye, _ = case(70)
     features[rows[66]] = float("nan")
     children, _ = decoder.decode(features, log_scales, rows, state, eye)
-    for value in (children.means, children.factors, children.opacities, children.colours):
+    for value in (children.means, children.factors, children.opacities, children.colors):
         assert torch.isnan(value[66]).all()
         assert torch.isfinite(value[:66]).all()
 

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from splashbench_methods.splashsplat.appearance import losses
-from splashbench_methods.splashsplat.appearance.decoder import CarrierState, Decoder, DecoderSettings
+from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.appearance.optimizer import RowAdam
+from splashbench_methods.splashsplat.carriers.subframe import CarrierState
 
 
 def decoder_with_constant_heads(**settings) -> Decoder:
@@ -62,7 +63,7 @@ def test_colour_sees_the_viewing_direction_and_shape_does_not():
     feature = torch.randn(1, 4, generator=torch.Generator().manual_seed(0))
     arguments = (feature, torch.zeros(1, 3), state(torch.eye(3)))
     front, side = decoder(*arguments, torch.zeros(3)), decoder(*arguments, torch.tensor([9.0, 0, 0]))
-    assert not torch.allclose(front.colours, side.colours)
+    assert not torch.allclose(front.colors, side.colors)
     assert torch.equal(front.means, side.means)
     assert torch.equal(front.factors, side.factors)
 
@@ -113,7 +114,7 @@ def test_separation_loss_is_a_squared_hinge():
 def test_colour_loss_is_the_variance_within_cells():
     colours = torch.tensor([0.1, 0.3, 0.8])[:, None, None].expand(3, 2, 3)
     cells, sizes = torch.tensor([0, 0, 1]), torch.tensor([2.0, 1.0])
-    assert float(losses.colour_loss(colours, cells, sizes)) == pytest.approx((0.01 + 0.01 + 0) / 3, rel=1e-5)
+    assert float(losses.color_loss(colours, cells, sizes)) == pytest.approx((0.01 + 0.01 + 0) / 3, rel=1e-5)
 
 
 def test_row_adam_moves_like_adam_and_leaves_other_rows_alone():

@@ -15,7 +15,7 @@ from splashbench_methods.splashsplat.flip.solver import (
     FlipTransport,
     gravity_in_voxels,
 )
-from splashbench_methods.splashsplat.motion.step import Step
+from splashbench_methods.splashsplat.motion.steps import FrameStep
 from splashbench_methods.splashsplat.motion.velocity import control_shape, velocities_at
 
 GRAVITY = np.array([0.0, 0.0, -500.0])  # voxels/s^2
@@ -216,11 +216,11 @@ def test_carriers_follow_the_simulation_by_their_number():
     flow = FlipTransport(solver, phi, 1.0, ids, start, np.random.default_rng(0))
     control = np.broadcast_to(np.float32([2, 0, 0]), (*control_shape(CUBE, 4), 3))  # voxels per frame
     F = np.broadcast_to(np.eye(3, dtype=np.float32), (3, 3, 3))
-    x, F = flow.forecast(ids, F, 0.05, Step(control, 4))
+    x, F = flow.forecast(ids, F, 0.05, FrameStep(control, 4))
     fall = 0.5 * 500 * 0.05**2
     np.testing.assert_allclose(x, start + np.array([2, 0, -fall]), atol=1e-4)
     # Carrier 5 is gone; the second frame lasts twice as long, and its fitted motion is not looked at.
-    x, F = flow.forecast(ids[[0, 2]], F[[0, 2]], 0.1, Step(0 * control, 4))
+    x, F = flow.forecast(ids[[0, 2]], F[[0, 2]], 0.1, FrameStep(0 * control, 4))
     np.testing.assert_allclose(x, start[[0, 2]] + np.array([6, 0, -9 * fall]), atol=1e-4)
     assert x.dtype == F.dtype == np.float32
     np.testing.assert_allclose(F, np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-5)

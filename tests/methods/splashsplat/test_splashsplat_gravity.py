@@ -9,15 +9,17 @@ from splashbench.observe import Silhouettes, sequence_bounds
 from splashbench.observe.container import depth_image
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_frame
-from splashbench.observe.occlusion import ContainerShadow
+from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
-from splashbench_methods.splashsplat.appearance.visibility import seen_by_any
-from splashbench_methods.splashsplat.fields.pool import Pool, Vessel, upright
-from splashbench_methods.splashsplat.fields.survey import survey
-from splashbench_methods.splashsplat.motion.ballistic import Jet, Slices, fit_jets, framed, open_floor, slices_of
+from splashbench_methods.splashsplat.carriers.visibility import seen_by_any
+from splashbench_methods.splashsplat.fields.gravity_cues import gravity_cues
+from splashbench_methods.splashsplat.fields.jet import Jet, Slices, fit_jets, framed, open_floor, slices_of
+from splashbench_methods.splashsplat.fields.pool import Pool
+from splashbench_methods.splashsplat.fields.vessel import Vessel, upright
+from splashbench_methods.splashsplat.motion.fall import JetFall, falls_of, table_of
 from splashbench_methods.splashsplat.motion.gate import gated
-from splashbench_methods.splashsplat.motion.step import Fall, Motion, Step, falls_of
+from splashbench_methods.splashsplat.motion.steps import FrameStep, Motion
 from splashbench_methods.splashsplat.motion.velocity import control_shape, velocity_at
 
 DOWN = np.array([0.0, -1.0, 0.0])
@@ -159,7 +161,7 @@ def test_slices_cut_by_an_image_edge_are_left_out():
 
 GRID = Grid(np.array([-0.1, 0.0, -0.1]), VOXEL, (40, 64, 40))
 JET = Jet(0.3, np.array([0.0, 0.0]), np.array([0.2, -0.1]), 1.0, G, 0.01)
-FALL = Fall(JET, 0.1, upright(DOWN), GRID, 0.033)
+FALL = JetFall(JET, 0.1, upright(DOWN), GRID, 0.033)
 SIDEWAYS = np.broadcast_to(np.float32([1, 0, 0]), (*control_shape(GRID.shape, 4), 3))
 
 
@@ -175,7 +177,7 @@ def eyes(count: int) -> np.ndarray:
 
 def test_what_is_in_the_jet_falls_and_what_is_beside_it_follows_the_fit():
     heights = np.array([0.15, 0.2, 0.25])
-    step = Step(SIDEWAYS, 4, FALL)
+    step = FrameStep(SIDEWAYS, 4, FALL)
     found = step.velocity(in_the_jet(heights)) * VOXEL / 0.033
     np.testing.assert_allclose(found, JET.velocity(heights) @ upright(DOWN), rtol=1e-5)
     for elsewhere in (in_the_jet(heights, aside=0.011 + VOXEL), in_the_jet(np.array([0.05, 0.09]))):
@@ -187,7 +189,7 @@ def test_what_is_in_the_jet_falls_and_what_is_beside_it_follows_the_fit():
 
 def test_carriers_in_the_jet_fly_on_their_parabola_and_stretch():
     start = in_the_jet(np.array([0.26]))
-    moved, F = Step(SIDEWAYS, 4, FALL).forecast(start, eyes(1))
+    moved, F = FrameStep(SIDEWAYS, 4, FALL).forecast(start, eyes(1))
     rise = np.array([0.0, 0.0, 1.0]) @ upright(DOWN)
     way = JET.velocity(np.array([0.26])) @ upright(DOWN) * 0.033 - 0.5 * G * 0.033**2 * rise
     np.testing.assert_allclose(moved, start + way / VOXEL, atol=1e-4)
@@ -196,22 +198,24 @@ def test_carriers_in_the_jet_fly_on_their_parabola_and_stretch():
     np.testing.assert_allclose(moved, in_the_jet(height), atol=1e-3)
     # Two carriers on top of each other part as F says: speeds grow downwards.
     tip = 1e-2 * rise / VOXEL
-    apart = (Step(SIDEWAYS, 4, FALL).forecast(start + tip.astype(np.float32), eyes(1))[0] - moved) / 1e-2 * VOXEL
+    apart = (FrameStep(SIDEWAYS, 4, FALL).forecast(start + tip.astype(np.float32), eyes(1))[0] - moved) / 1e-2 * VOXEL
     np.testing.assert_allclose(F[0] @ rise, apart[0], atol=0.02)
     assert F[0] @ rise @ rise > 1.05
     # One that lands within the first half of the step is left to the fit.
     low = in_the_jet(np.array([0.1 + 0.4 * 0.033 * 1.0]))
-    np.testing.assert_allclose(Step(SIDEWAYS, 4, FALL).forecast(low, eyes(1))[0], low + np.array([1, 0, 0]), atol=1e-5)
+    np.testing.assert_allclose(
+        FrameStep(SIDEWAYS, 4, FALL).forecast(low, eyes(1))[0], low + np.array([1, 0, 0]), atol=1e-5
+    )
     # Halves of a step, forwards or backwards, make whole ones.
-    half = Step(SIDEWAYS, 4, FALL).forecast(*Step(SIDEWAYS, 4, FALL).forecast(start, eyes(1), 0.5), 0.5)[0]
+    half = FrameStep(SIDEWAYS, 4, FALL).forecast(*FrameStep(SIDEWAYS, 4, FALL).forecast(start, eyes(1), 0.5), 0.5)[0]
     np.testing.assert_allclose(half, moved, atol=1e-3)
-    back = Step(SIDEWAYS, 4, FALL).forecast(moved, eyes(1), -1.0)[0]
+    back = FrameStep(SIDEWAYS, 4, FALL).forecast(moved, eyes(1), -1.0)[0]
     np.testing.assert_allclose(back, start, atol=1e-3)
 
 
 def test_motion_is_read_as_it_was_written():
     motion = Motion(np.stack([SIDEWAYS, SIDEWAYS]), 4, [None, FALL])
-    again = falls_of(*motion.table(), GRID, np.array([0.0, 0.1, 0.133]))
+    again = falls_of(*table_of(motion.falls), GRID, np.array([0.0, 0.1, 0.133]))
     assert again[0] is None
     assert again[1] is not None
     points = in_the_jet(np.array([0.15, 0.25]))
@@ -219,8 +223,8 @@ def test_motion_is_read_as_it_was_written():
     np.testing.assert_array_equal(again[1].holds(points), [True, True])
     assert motion.half().velocities.dtype == np.float16
     with pytest.raises(ValueError, match="jets of shape"):
-        falls_of(*motion.table(), GRID, np.array([0.0, 0.1]))
-    rows, turn = motion.table()
+        falls_of(*table_of(motion.falls), GRID, np.array([0.0, 0.1]))
+    rows, turn = table_of(motion.falls)
     rows[1, 6] = 0
     with pytest.raises(ValueError, match="gravity"):
         falls_of(rows, turn, GRID, np.array([0.0, 0.1, 0.133]))
@@ -306,11 +310,11 @@ def test_a_plate_is_no_vessel():
 
 def test_the_dome_over_a_pool_goes_and_the_pool_is_full(poured):
     silhouettes = Silhouettes(poured)
-    container = ContainerShadow(poured.mesh, DOWN)
+    container = ContainerOcclusion(poured.mesh, DOWN)
     grid = Grid.over(sequence_bounds(silhouettes, container).padded(0.1), 56)
     phi = carve_frame(silhouettes, grid, 0)
-    shadows = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    settled = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi, grid, 0.06, shadows)
+    depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
+    settled = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi, grid, 0.06, depths)
     points = grid.nodes()
     truth = (np.abs(points[..., 0]) < 0.1) & (np.abs(points[..., 2]) < 0.08) & (points[..., 1] > 0)
     truth &= points[..., 1] < 0.06
@@ -331,8 +335,8 @@ def test_what_falls_into_the_pool_is_kept(poured):
     jet = Jet(0.2, np.zeros(2), np.zeros(2), 1.0, G, 0.02)
     phi = np.full(grid.shape, -5, np.float32)
     pool = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True)
-    shadows = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    low, kept = pool.lowered(phi, grid, 0.06, shadows), pool.lowered(phi, grid, 0.06, shadows, jet)
+    depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
+    low, kept = pool.lowered(phi, grid, 0.06, depths), pool.lowered(phi, grid, 0.06, depths, jet)
     node = tuple(np.round(grid.to_voxels(np.array([0.0, 0.09, 0.0]))).astype(int))
     assert low[node] > 0 > kept[node]
 
@@ -342,10 +346,10 @@ def test_what_falls_into_the_pool_is_kept(poured):
 
 def test_carriers_land_on_the_pool_and_on_the_walls(poured):
     silhouettes = Silhouettes(poured)
-    container = ContainerShadow(poured.mesh, DOWN)
+    container = ContainerOcclusion(poured.mesh, DOWN)
     bounds = sequence_bounds(silhouettes, container).padded(0.1)
-    shadows = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    known = survey(silhouettes, bounds, container, DOWN, None, np.arange(2.0), shadows)
+    depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
+    known = gravity_cues(silhouettes, bounds, container, DOWN, None, np.arange(2.0), depths)
     assert known.jets == [None, None]
     grid = Grid.over(Bounds(np.full(3, -0.2), np.full(3, 0.2)), 80)
     start = grid.to_voxels(np.array([[0, 0.15, 0], [0, 0.03, 0], [0, 0.15, 0], [0, 0.15, 0]]))

@@ -14,9 +14,9 @@ from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench.synth.balls import ball_centers, write_balls_scene
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat.carriers.subframe import locate
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.reconstruction import fit_liquid
-from splashbench_methods.splashsplat.subframe import locate
 
 TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
 

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from splashbench.observe.grid import Grid
+from splashbench_methods.splashsplat.carriers.correction import correct
+from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.resampling import (
     ShellSettings,
     cell_of,
     newborns,
     within_capacity,
 )
-from splashbench_methods.splashsplat.carriers.tracking import Carriers, CarrierSettings, track_carriers
-from splashbench_methods.splashsplat.carriers.transport import clamp_stretch, correct, forecast
-from splashbench_methods.splashsplat.motion.step import Motion
+from splashbench_methods.splashsplat.carriers.tracking import CarrierSettings, CarrierTracker, Tracking
+from splashbench_methods.splashsplat.motion.advection import clamp_stretch, forecast
+from splashbench_methods.splashsplat.motion.steps import Motion
 from splashbench_methods.splashsplat.motion.velocity import (
     DivergenceFree,
     VelocityFit,
@@ -181,7 +183,10 @@ def track(fields, velocities=None, **settings) -> Carriers:
     if velocities is None:
         velocities = np.zeros((pairs, *control_shape((SIZE,) * 3, FACTOR), 3), dtype=np.float32)
     motion = Motion(velocities, FACTOR, [None] * pairs)
-    return track_carriers(fields, GRID, GRID, motion, CarrierSettings(shell=SHELL, **settings), seed=3)
+    tracker = CarrierTracker(Tracking(GRID, GRID, CarrierSettings(shell=SHELL, **settings), seed=3))
+    for t, phi in enumerate(fields):
+        tracker.advance(phi, None if t == 0 else motion.step(t - 1))
+    return tracker.carriers()
 
 
 def test_newborns_fill_the_shell_and_nothing_else():

@@ -10,28 +10,41 @@ import pytest
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench_methods.splashsplat.fields import observations
-from splashbench_methods.splashsplat.fields.observations import Observations
+from splashbench_methods.splashsplat.fields.observations import Observations, Report, observe
+from splashbench_methods.splashsplat.motion.observed_frames import ObservedFrame, observed_frames
 from splashbench_methods.splashsplat.settings import SplashSplatConfig
 
 SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 8, "velocity_steps": 3}
 
 
-def _observed(scene: Scene, run: Run, **settings: object) -> tuple[list[np.ndarray], Observations]:
+def _observed(
+    scene: Scene, run: Run, report: Report = lambda done, what: None, **settings: object
+) -> tuple[Observations, list[ObservedFrame]]:
     config = SplashSplatConfig.model_validate({**SMALL, **settings})
-    observed = Observations(scene.training(), config, run, lambda done, message: None)
-    return list(observed), observed
+    training = scene.training()
+    observed = observe(training, config.fields, run, report)
+    return observed, list(observed_frames(observed, training, config.motion, run, report))
+
+
+def _assert_same(frames: list[ObservedFrame], others: list[ObservedFrame]) -> None:
+    for frame, other in zip(frames, others, strict=True):
+        np.testing.assert_array_equal(frame.phi, other.phi)
+        np.testing.assert_array_equal(frame.packed, other.packed)
+        assert (frame.step is None) == (other.step is None)
+        if frame.step is not None and other.step is not None:
+            np.testing.assert_array_equal(frame.step.control, other.step.control)
 
 
 def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path) -> None:
-    alone, by_itself = _observed(balls, Run())
+    by_itself, alone = _observed(balls, Run())
     runs = [Run(cache=tmp_path), Run(cache=tmp_path, seed=1)]
     for run in runs:
-        phi, observed = _observed(balls, run)
-        np.testing.assert_array_equal(phi, alone)
-        np.testing.assert_array_equal(observed.packed, by_itself.packed)
-        np.testing.assert_array_equal(observed.motion.velocities, by_itself.motion.velocities)
+        observed, frames = _observed(balls, run)
+        _assert_same(frames, alone)
         np.testing.assert_array_equal(observed.hull_grid.origin, by_itself.hull_grid.origin)
-    assert np.any(by_itself.motion.velocities)
+    assert len(alone) == balls.n_frames
+    assert alone[0].step is None
+    assert all(frame.step is not None and frame.step.control.any() for frame in alone[1:])
     first, second = runs
     assert first.reused == {}
     assert list(second.reused) == ["bounds", "distances", "velocities"]
@@ -49,8 +62,8 @@ def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path
         ({"transport_cells": 20}, ["bounds", "distances"]),
         ({"variant": "per_frame"}, ["bounds", "distances"]),
         ({"hull_cells": 36}, []),
-        ({"distance": "carve"}, []),
-        ({"detect_failures": False}, []),
+        ({"signed_distance": "carve"}, []),
+        ({"detect_failed_masks": False}, []),
         ({"container": False}, []),
         ({"camera_times": False}, []),
         ({"pool": False}, []),
@@ -62,22 +75,20 @@ def test_another_run_takes_over_what_its_settings_leave_as_it_was(
 ) -> None:
     _observed(balls, Run(cache=tmp_path))
     run = Run(cache=tmp_path)
-    shared_phi, shared = _observed(balls, run, **settings)
+    _, shared = _observed(balls, run, **settings)
     assert list(run.reused) == taken_over
-    phi, alone = _observed(balls, Run(), **settings)
-    np.testing.assert_array_equal(shared_phi, phi)
-    np.testing.assert_array_equal(shared.packed, alone.packed)
-    np.testing.assert_array_equal(shared.motion.velocities, alone.motion.velocities)
+    _, alone = _observed(balls, Run(), **settings)
+    _assert_same(shared, alone)
 
 
 def test_masks_that_failed_stay_distrusted(balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distrusted = np.zeros((balls.n_frames, len(balls.train)), dtype=bool)
     distrusted[[1, 4], [0, 2]] = True
     monkeypatch.setattr(observations, "distrust_failed_masks", lambda masks, container: masks.distrust(distrusted))
-    _, first = _observed(balls, Run(cache=tmp_path))
+    first, _ = _observed(balls, Run(cache=tmp_path))
     monkeypatch.undo()
     run = Run(cache=tmp_path)
-    _, second = _observed(balls, run)
+    second, _ = _observed(balls, run)
     assert list(run.reused) == ["bounds", "distances", "velocities"]
     np.testing.assert_array_equal(first.silhouettes.failed_masks, distrusted)
     np.testing.assert_array_equal(second.silhouettes.failed_masks, distrusted)
@@ -104,9 +115,7 @@ def test_a_run_that_ends_in_the_middle_leaves_no_file_behind(
 
 def test_progress_never_goes_back(balls: Scene, tmp_path: Path) -> None:
     for run in (Run(cache=tmp_path), Run(cache=tmp_path), Run()):
-        told: list[float] = []
-        config = SplashSplatConfig.model_validate(SMALL)
-        for _ in Observations(balls.training(), config, run, lambda done, message, told=told: told.append(done)):
-            pass
-        assert told == sorted(told)
-        assert told[-1] == 1
+        progress: list[float] = []
+        _observed(balls, run, lambda done, what, progress=progress: progress.append(done))  # type: ignore[misc]
+        assert progress == sorted(progress)
+        assert progress[-1] == 1

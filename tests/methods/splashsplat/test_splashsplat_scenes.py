@@ -13,7 +13,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Run
 from splashbench.scene import Camera, Scene
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
-from splashbench_methods.splashsplat.appearance.occlusion import Occlusion
+from splashbench_methods.splashsplat.fields.occlusion import LiquidOcclusion
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.reconstruction import fit_liquid
 
@@ -27,7 +27,7 @@ class Grey:
         return np.full((camera.height, camera.width, 3), 0.5, np.float32)
 
 
-def as_fitted(liquid: Liquid, occlusion: Occlusion | None) -> FittedSplashSplat:
+def as_fitted(liquid: Liquid, occlusion: LiquidOcclusion | None) -> FittedSplashSplat:
     return FittedSplashSplat(liquid, Grey(), occlusion)
 
 
@@ -155,7 +155,7 @@ def test_a_saved_container_that_is_broken_is_named(tmp_path: Path):
     faces = np.array([[0, 1, 9]])
     np.savez_compressed(tmp_path / "container.npz", vertices=np.eye(3), faces=faces, tolerance=np.ones(1))
     with pytest.raises(SplashbenchError, match=r"container\.npz"):
-        Occlusion.load(tmp_path)
+        LiquidOcclusion.load(tmp_path)
 
 
 def test_stages_of_the_fit_are_told(balls_copy: Path):

@@ -121,13 +121,13 @@ def test_a_scene_that_is_soon_explained_is_soon_fitted(many_balls: Scene, monkey
 
     monkeypatch.setattr(AdaptiveSchedule, "look", note)
     monkeypatch.setattr(fit, "_LOOK_EVERY", 20)
-    few = fitted(many_balls, iterations=600, withheld_share=0.1, stop_gain=0.2)
+    few = fitted(many_balls, iterations=600, validation_share=0.1, stop_gain=0.2)
     assert len(looks) >= 3
     assert looks[-1][1] < 0.9 * looks[0][1]  # what is withheld is explained better and better
     assert len(few) == looks[-1][0] * 1.5  # and the rates fall from the last look on
     assert len(few) < 500
     assert few[-1] == pytest.approx(1)
-    assert len(fitted(many_balls, iterations=60, withheld_share=0.0)) == 60
+    assert len(fitted(many_balls, iterations=60, validation_share=0.0)) == 60
 
 
 def test_withheld_photographs_are_fitted_once_the_rates_fall(many_balls: Scene, monkeypatch: pytest.MonkeyPatch):
@@ -142,7 +142,7 @@ def test_withheld_photographs_are_fitted_once_the_rates_fall(many_balls: Scene, 
         return real(image, alpha, target, *others)
 
     monkeypatch.setattr(fit, "image_loss", note)
-    fitted(many_balls, iterations=450, withheld_share=0.1, stop_gain=0.0)
+    fitted(many_balls, iterations=450, validation_share=0.1, stop_gain=0.0)
     first, second = set(seen[:300]), set(seen[300:])
     everything = len(first | second)
     assert 0.08 * everything <= len(second - first) <= 0.1 * everything + 1

@@ -103,9 +103,9 @@ def test_the_same_seed_has_the_same_cells_and_another_one_others() -> None:
 
 def test_settings_reach_the_fit() -> None:
     presets = {name: SplashSplatConfig.model_validate(values) for name, values in SplashSplatConfig.presets.items()}
-    assert {name: config.optimisation.shared_cells for name, config in presets.items()} == {
+    assert {name: config.optimisation.feature_cells for name, config in presets.items()} == {
         "best": (4.0, 16.0),
         "paper": (),
         "quick": (4.0, 16.0),
     }
-    assert SplashSplatConfig(learning_rate_shared=0.007).optimisation.learning_rate_shared == 0.007
+    assert SplashSplatConfig(learning_rate_cells=0.007).optimisation.learning_rate_cells == 0.007

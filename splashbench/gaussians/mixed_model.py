@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import atomic_path, read_npz
-from splashbench.gaussians.fitting import History
+from splashbench.gaussians.dynamic_model import DynamicModel
+from splashbench.gaussians.fitting import FitHistory
 from splashbench.gaussians.photographs import unit_time
-from splashbench.gaussians.splats import DynamicModel
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Render
 from splashbench.observe.consistency import silhouette_consistent
@@ -40,7 +40,7 @@ class _Masked:
 class MixedFitted(Fitted):
     """`model`, fitted to `scene`."""
 
-    def __init__(self, model: DynamicModel, scene: TrainingScene, history: History | None = None) -> None:
+    def __init__(self, model: DynamicModel, scene: TrainingScene, history: FitHistory | None = None) -> None:
         self.model, self.scene, self.history = model.eval(), scene, history
         self._liquid: dict[int, NDArray[np.bool_]] = {}
         self._masked = _Masked(scene, {name: self.lens(camera) for name, camera in scene.cameras.items()})

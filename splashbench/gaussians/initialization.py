@@ -2,8 +2,8 @@
 
 The paper starts every method from points sampled from the mask-derived hull of the training views (supplement,
 "Baselines"). What is no liquid starts from the scene's sparse points, or from the training views' pixels lifted to
-their depth (scaffold_gs/anchors.py). Views that are of one colour throughout, such as those of made-up liquid over
-white, have nothing there whose depth could be told: that colour then lies behind everything, without any points.
+their depth (anchor_seeds.py). Views of one colour throughout, such as those of synthetic liquid over white, show
+nothing whose depth could be told: that colour then lies behind everything, without any points.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from splashbench.background.clean_plate import make_plate
+from splashbench.background.clean_plate import make_clean_plate
 from splashbench.errors import SplashbenchError
-from splashbench.gaussians.anchors import seed_anchors, sparse_anchors
+from splashbench.gaussians.anchor_seeds import seed_anchors, sparse_anchors
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.observe.initial_points import initial_points
@@ -32,7 +32,7 @@ _PLAIN = 3
 
 
 @dataclass(frozen=True)
-class Start:
+class StartingPoints:
     """Points to start from: positions [N, 3] and spacing [N] in scene units, colors [N, 3] in [0, 1].
 
     spacing: mean distance to the three nearest points of the same instant. frame: [N] timestep of a point of the
@@ -53,7 +53,7 @@ class Start:
         return None if self.backdrop is None else torch.from_numpy(self.backdrop)
 
 
-class StartSettings(Protocol):
+class InitializationSettings(Protocol):
     """What a method's settings say of its start; see settings.py."""
 
     static: Literal["pixels", "points"]
@@ -62,9 +62,9 @@ class StartSettings(Protocol):
 
 
 @contextmanager
-def started(
-    scene: TrainingScene, settings: StartSettings, run: Run, largest_only: bool = False
-) -> Iterator[tuple[Start, np.random.Generator]]:
+def initialization(
+    scene: TrainingScene, settings: InitializationSettings, run: Run, largest_only: bool = False
+) -> Iterator[tuple[StartingPoints, np.random.Generator]]:
     """All points that a fit starts from, and the generator of its random numbers; within, torch is seeded as well.
 
     largest_only: see `hull_points`.
@@ -86,7 +86,7 @@ def started(
 
 def static_points(
     scene: TrainingScene, count: int, source: Literal["pixels", "points"], rng: np.random.Generator, run: Run
-) -> Start:
+) -> StartingPoints:
     """At most `count` points of what is no liquid: lifted pixels or, by `source`, the scene's sparse points.
 
     Pixels, too, where a scene has no sparse points, which the user is told; no points but a backdrop where the views
@@ -96,7 +96,7 @@ def static_points(
     if source == "points" and sparse is not None and len(sparse):
         seed = sparse_anchors(sparse, count)
     else:
-        plates = [make_plate(scene, name, _PLATE_SIDE) for name in scene.train]
+        plates = [make_clean_plate(scene, name, _PLATE_SIDE) for name in scene.train]
         plates = [plate for plate in plates if plate.seen.any()]
         if not plates:
             raise SplashbenchError(f"{scene.name}: the masks cover every training image whole; correct them")
@@ -106,7 +106,7 @@ def static_points(
         if source == "points":
             run.progress(0, "no sparse points: pixels lifted instead")
         seed = seed_anchors(sparse, plates, count, rng)
-    return Start(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
+    return StartingPoints(seed.positions, seed.colors, seed.spacing, np.full(len(seed.positions), -1))
 
 
 def plain_color(views: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32] | None:
@@ -116,7 +116,7 @@ def plain_color(views: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32] | Non
     return (color / 255).astype(np.float32) if plain else None
 
 
-def hull_points(scene: TrainingScene, count: int, largest_only: bool = False) -> Start:
+def hull_points(scene: TrainingScene, count: int, largest_only: bool = False) -> StartingPoints:
     """Some `count` points on the surface of the liquid's hull, in the colours of the views; none without liquid.
 
     They are spread evenly over the frames or, with `largest_only`, all of the frame in which the views see most of it.
@@ -129,10 +129,10 @@ def hull_points(scene: TrainingScene, count: int, largest_only: bool = False) ->
     return _joined([_cloud(clouds[t], t) for t in frames])
 
 
-def _cloud(points: NDArray[np.float64], t: int) -> Start:
+def _cloud(points: NDArray[np.float64], t: int) -> StartingPoints:
     """The start of timestep `t` from `points` [n, 6], positions and colours."""
     positions, colors = points[:, :3].astype(np.float32), points[:, 3:].astype(np.float32)
-    return Start(positions, colors, _spacing(positions), np.full(len(points), t))
+    return StartingPoints(positions, colors, _spacing(positions), np.full(len(points), t))
 
 
 def _spacing(positions: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -142,17 +142,17 @@ def _spacing(positions: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.maximum(distance, 1e-6), np.float32)
 
 
-def _joined(parts: list[Start]) -> Start:
+def _joined(parts: list[StartingPoints]) -> StartingPoints:
     if not parts:
         nothing = np.empty((0, 3), np.float32)
-        return Start(nothing, nothing, np.empty(0, np.float32), np.empty(0, np.int64))
+        return StartingPoints(nothing, nothing, np.empty(0, np.float32), np.empty(0, np.int64))
     names = ("positions", "colors", "spacing", "frame")
     backdrop = next((part.backdrop for part in parts if part.backdrop is not None), None)
     tables = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Start(**tables, backdrop=backdrop)
+    return StartingPoints(**tables, backdrop=backdrop)
 
 
-def joined(*parts: Start) -> Start:
+def joined(*parts: StartingPoints) -> StartingPoints:
     """All points of `parts`."""
     return _joined(list(parts))
 

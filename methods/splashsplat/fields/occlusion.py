@@ -1,6 +1,7 @@
-"""What the container hides: liquid behind its wall is not drawn, and has no part in what a view shows.
+"""Which carriers the container hides from a camera: they are not drawn, and do not explain what a view shows.
 
-Per carrier and view, by depth at the carrier's centre. The paper composites by the depth of Gaussians alone.
+Decided per carrier and view, by the container's depth at the carrier's centre; `splashbench.observe.occlusion` does the
+same for carving. The paper composites by the depth of Gaussians alone.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
 _FILE = "container.npz"
-# Cameras whose depth images are held; the oldest goes.
-_KEPT = 24
+# Depth images in memory; the oldest goes.
+_MAX_DEPTH_IMAGES = 24
 
 
-class Occlusion:
+class LiquidOcclusion:
     """An opaque container between cameras and liquid.
 
     mesh: in scene units. tolerance: points this much behind its surface are seen still, scene units.
@@ -34,7 +35,7 @@ class Occlusion:
         """Depth of the container in `camera`'s image, float32 [H, W], inf where there is none."""
         # By identity, as arrays make no key; the camera is kept so that its number is not given to another.
         if id(camera) not in self._depths:
-            if len(self._depths) >= _KEPT:
+            if len(self._depths) >= _MAX_DEPTH_IMAGES:
                 self._depths.pop(next(iter(self._depths)))
             self._depths[id(camera)] = camera, depth_image(self.mesh, camera)
         return self._depths[id(camera)][1]
@@ -50,7 +51,7 @@ class Occlusion:
         )
 
     @classmethod
-    def load(cls, directory: Path) -> Occlusion | None:
+    def load(cls, directory: Path) -> LiquidOcclusion | None:
         """Read what `save` wrote; None where `directory` has none. Raises SplashbenchError naming the file at fault."""
         path = directory / _FILE
         if not path.is_file():

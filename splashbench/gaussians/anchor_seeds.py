@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from splashbench.background.clean_plate import Plate
+from splashbench.background.clean_plate import CleanPlate
 from splashbench.background.depth import DepthMap, depth_maps, guessed, interpolated, lift, pixels_at
 
 # Lifted points per anchor kept: voxels merge what several views see.
@@ -54,7 +54,7 @@ def sparse_anchors(points: NDArray[np.float32], count: int) -> AnchorSeed:
 
 
 def seed_anchors(
-    points: NDArray[np.float32] | None, plates: list[Plate], count: int, rng: np.random.Generator
+    points: NDArray[np.float32] | None, plates: list[CleanPlate], count: int, rng: np.random.Generator
 ) -> AnchorSeed:
     """At most `count` anchors from sparse points [N, 6 or more] (x y z r g b ...), or None, and the training plates."""
     pixels = sum(plate.camera.width * plate.camera.height for plate in plates)
@@ -68,9 +68,9 @@ def seed_anchors(
 
 def _lift(
     points: NDArray[np.float32] | None,
-    plate: Plate,
+    plate: CleanPlate,
     depth: DepthMap | None,
-    plates: list[Plate],
+    plates: list[CleanPlate],
     stride: float,
     rng: np.random.Generator,
 ) -> tuple[NDArray, NDArray]:

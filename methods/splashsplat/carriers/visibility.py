@@ -27,7 +27,7 @@ def _seen(
     points: np.ndarray,
     eye: np.ndarray,
     projection: np.ndarray,
-    shadow: np.ndarray,
+    container_depth: np.ndarray,
     tolerance: float,
     limit: float,
     scale: float,
@@ -43,11 +43,11 @@ def _seen(
         depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
         if depth <= 0:
             continue
-        if shadow.shape[0] > 0:
+        if container_depth.shape[0] > 0:
             u = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / depth
             v = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / depth
-            inside = 0 <= u < shadow.shape[1] and 0 <= v < shadow.shape[0]
-            if inside and depth > shadow[int(v), int(u)] + tolerance:
+            inside = 0 <= u < container_depth.shape[1] and 0 <= v < container_depth.shape[0]
+            if inside and depth > container_depth[int(v), int(u)] + tolerance:
                 continue
         dx, dy, dz = eye[0] - x, eye[1] - y, eye[2] - z
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -74,19 +74,19 @@ def seen_by_any(
     grid: Grid,
     points: np.ndarray,
     cameras: Sequence[Camera],
-    shadows: Sequence[np.ndarray | None],
+    container_depths: Sequence[np.ndarray | None],
     limit: float,
     scale: float = 1.0,
 ) -> np.ndarray:
     """bool [N]: whether a camera sees `points` [N, 3] (node coordinates of `grid`) through at most `limit` voxels of
     liquid.
 
-    phi: signed distance on `grid`, float32; `scale` makes voxels of it. shadows: the container's depth image of each
-    camera, or None.
+    phi: signed distance on `grid`, float32; `scale` makes voxels of it. container_depths: per camera the depth image
+    of the container, or None.
     """
     seen = np.zeros(len(points), dtype=bool)
     points = np.ascontiguousarray(points, dtype=np.float32)
-    for camera, shadow in zip(cameras, shadows):
+    for camera, container_depth in zip(cameras, container_depths):
         # The projection of node coordinates.
         to_scene = np.diag([grid.voxel, grid.voxel, grid.voxel, 1.0])
         to_scene[:3, 3] = grid.origin
@@ -95,7 +95,7 @@ def seen_by_any(
             points,
             (camera.center - grid.origin) / grid.voxel,
             np.ascontiguousarray(camera.projection @ to_scene),
-            np.zeros((0, 0), np.float32) if shadow is None else shadow,
+            np.zeros((0, 0), np.float32) if container_depth is None else container_depth,
             grid.voxel,
             float(limit),
             float(scale),

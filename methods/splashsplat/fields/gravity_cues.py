@@ -1,6 +1,6 @@
-"""A first look at the whole sequence, before any frame is reconstructed: where the jet is, and how high the pool.
+"""What gravity says of a sequence before any frame is reconstructed: where the jet is, and how high the pool stands.
 
-Both follow from gravity, the container and the masks of all frames; see ballistic.py and pool.py. Not in the paper.
+Both follow from gravity, the container and the masks of all frames; see jet.py and pool.py. Not in the paper.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from splashbench.observe.grid import Bounds, Grid
-from splashbench.observe.occlusion import ContainerShadow
+from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.observe.signed_distance import signed_distance_frames
 from splashbench.observe.silhouettes import Silhouettes
 
-from ..flip.solver import STANDARD_GRAVITY
-from ..motion.ballistic import Jet, Slices, fit_jets, framed, open_floor, slices_of
-from .pool import Pool, Vessel, upright
+from .jet import STANDARD_GRAVITY, Jet, Slices, fit_jets, framed, open_floor, slices_of
+from .pool import Pool
+from .vessel import Vessel, upright
 
 _CELLS = 96
 # What is within so many voxels above a container's rim may rest on it.
@@ -24,12 +24,12 @@ _RIM_MARGIN = 4
 
 
 @dataclass(frozen=True)
-class Survey:
+class GravityCues:
     """What is known of the liquid before it is reconstructed.
 
     turn: [3, 3] scene axes to upright ones. jets: per frame, or None. floor: height above which the jets were found,
-    scene units. pool, levels: the pool and its height per frame (NaN: none), or None and all NaN. shadows: per view
-    the container's depth image, None where it hides nothing.
+    scene units. pool, levels: the pool and its height per frame (NaN: none), or None and all NaN. container_depths:
+    per view the container's depth image, None where it hides nothing.
     """
 
     turn: np.ndarray
@@ -37,13 +37,13 @@ class Survey:
     floor: float
     pool: Pool | None
     levels: np.ndarray
-    shadows: list[np.ndarray | None]
+    container_depths: list[np.ndarray | None]
 
     def refined(self, phi: np.ndarray, grid: Grid, t: int) -> np.ndarray:
         """The hull's distance `phi` of frame `t` on `grid` (voxels), with a full pool and without what floats on it."""
         if self.pool is None or not np.isfinite(self.levels[t]):
             return phi
-        return self.pool.lowered(phi, grid, float(self.levels[t]), self.shadows, self.jets[t])
+        return self.pool.lowered(phi, grid, float(self.levels[t]), self.container_depths, self.jets[t])
 
     def jet_floor(self, t: int) -> float:
         """Height down to which the jet of frame `t` flies freely: the pool's level, or where the jets were found."""
@@ -74,21 +74,21 @@ class Survey:
         return (start + stays[:, None] * (end - start)).astype(np.float32)
 
 
-def survey(
+def gravity_cues(
     silhouettes: Silhouettes,
     bounds: Bounds,
-    container: ContainerShadow | None,
+    container: ContainerOcclusion | None,
     gravity: np.ndarray,
     metres_per_unit: float | None,
     times: np.ndarray,
-    shadows: list[np.ndarray | None],
+    container_depths: list[np.ndarray | None],
     find_pool: bool = True,
     find_jets: bool = True,
-) -> Survey:
+) -> GravityCues:
     """Look at all frames on a coarse grid over `bounds`.
 
     gravity: unit vector [3]. metres_per_unit: None where the scale or the frames' times are not known; then no jet is
-    looked for, as the speed of a fall is not known either. shadows: per view the container's depth image, or None.
+    looked for, as the speed of a fall is not known either. container_depths: see `GravityCues`.
     """
     turn = upright(gravity)
     vessel = None if container is None else Vessel.of(container.mesh, gravity)
@@ -107,4 +107,4 @@ def survey(
         floor = open_floor(frames, grid.voxel) if vessel is None else vessel.rim + _RIM_MARGIN * grid.voxel
         airborne = [framed(frame.above(floor), silhouettes.cameras, turn) for frame in frames]
         jets = fit_jets(airborne, times, STANDARD_GRAVITY / metres_per_unit, grid.voxel)
-    return Survey(turn, jets, floor, pool, levels, shadows)
+    return GravityCues(turn, jets, floor, pool, levels, container_depths)

@@ -1,11 +1,11 @@
-"""The jet: liquid in the air falls freely, and gravity is known.
+"""The speed of a falling jet from its shape: liquid in the air falls freely, and gravity is known.
 
 The hull's surface says little of how fast a steady stream runs through it: nothing visible moves. Its shape does. In
-free fall the path of a steady jet bends by g / (2 v_h^2), its level cross-section thins as 1 / vertical speed, and its
-first drop and its last fall as any stone does. One vertical speed w at one height explains all of these; it is found by
+free fall the path of a steady jet bends by g / (2 v_h^2), and its level cross-section thins as 1 / vertical speed. Its
+first drop and its last fall as any stone does. One vertical speed w at one height explains all of these. It is found by
 trying speeds, the horizontal motion following linearly. Not in the paper, which fits all motion by level sets.
 
-Coordinates are upright (pool.py): horizontal two, then height. Scene units and seconds.
+Coordinates are upright (vessel.py): horizontal two, then height. Scene units and seconds.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from splashbench.scene.camera import Camera
 
+STANDARD_GRAVITY = 9.81  # m/s^2
 # What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, of its radius
 # (voxels), and of the height of a tip or tail (voxels).
 _MIDDLE, _AREA, _RADIUS, _END = 0.1, 0.2, 0.5, 2.0

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.gaussians.dynamic_model import Splats, rotation_matrices
 from splashbench.gaussians.optimizer import RowOptimizer
-from splashbench.gaussians.screen import screen_gradients
-from splashbench.gaussians.splats import Splats, rotation_matrices
+from splashbench.gaussians.screen_gradients import screen_gradients
 from splashbench.scene import Camera
 
 _SHRINK = 1.6
@@ -29,7 +29,7 @@ class DensitySettings:
 
     start, stop, every: rounds of growth and pruning. prune_until: pruning alone goes on to here. gradient: mean screen
     gradient above which a primitive is cloned or split. large: size above which it is split, scene units. opacity:
-    below which it is pruned. most: primitives at most. reset_every: steps between opacity resets, 0 for never.
+    below which it is pruned. max_gaussians: primitives at most. reset_every: steps between opacity resets, 0 for never.
     reset_until: after which there are none.
     """
 
@@ -38,7 +38,7 @@ class DensitySettings:
     every: int
     gradient: float
     large: float
-    most: int
+    max_gaussians: int
     opacity: float = 0.005
     prune_until: int = 0
     reset_every: int = 0
@@ -104,7 +104,7 @@ class DensityControl:
         bright = self._bright()
         mean[~bright] = 0
         chosen = np.flatnonzero(mean > settings.gradient)
-        room = max(0, settings.most - int(bright.sum()))
+        room = max(0, settings.max_gaussians - int(bright.sum()))
         chosen = np.sort(chosen[np.argsort(-mean[chosen], kind="stable")][:room])
         rows = torch.from_numpy(chosen)
         new = {name: model.get_parameter(name).detach()[rows] for name in self.optimizer.rows}

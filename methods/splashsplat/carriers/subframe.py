@@ -18,9 +18,8 @@ from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 from splashbench.scene.geometry import STEPS_PER_VOXEL
 
-from .appearance.decoder import CarrierState
-from .carriers.tracking import Carriers
-from .motion.step import Motion
+from ..motion.steps import Motion
+from .population import Carriers
 
 # Times nearer to a frame than this fraction of the step are that frame: JSON and the harness round seconds.
 _SAME_FRAME = 1e-4
@@ -43,9 +42,23 @@ def locate(times: np.ndarray, time: float) -> tuple[int, float]:
     return (t, fraction) if fraction <= 0.5 else (t + 1, fraction - 1)
 
 
+@dataclass
+class CarrierState:
+    """What the decoder needs of n active carriers at one instant.
+
+    positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels. visibility: [n] in [0, 1], by
+    which opacities are multiplied where the carriers are hidden from the view at hand; all are seen by default.
+    """
+
+    positions: Tensor
+    deformation: Tensor
+    phi: Tensor
+    visibility: Tensor | None = None
+
+
 @dataclass(frozen=True)
 class Track:
-    """Carriers and what moves them. phi: int8 [T, nx, ny, nz] on `grid`, see `model.pack_phi`."""
+    """Carriers and what moves them. phi: int8 [T, nx, ny, nz] on `grid`, see `pack_signed_distance`."""
 
     grid: Grid
     carriers: Carriers
