@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.background.depth import look_at
+from splashbench.background.depth import common_target
 from splashbench.background.plane_sweep import for_opencv, plane_homography
 from splashbench.files import write_json
 from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
@@ -41,7 +41,7 @@ class NearestView(Fitted):
 
     def __init__(self, scene: TrainingScene) -> None:
         self.scene = scene
-        self.center = look_at(list(scene.cameras.values()))
+        self.center = common_target(list(scene.cameras.values()))
 
     def source(self, camera: Camera) -> Camera:
         """The training camera that sees the scene's centre from the most similar direction."""

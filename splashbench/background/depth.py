@@ -166,7 +166,7 @@ def _affine(at: NDArray, inverse: NDArray, uv: NDArray, distance: NDArray, aroun
     return np.asarray(np.linalg.solve(normal, weighted @ inverse[around][..., None])[:, 0, 0])
 
 
-def look_at(cameras: list[Camera]) -> NDArray[np.float64]:
+def common_target(cameras: list[Camera]) -> NDArray[np.float64]:
     """The point [3] nearest to the rays through all image centres, in the sense of least squares."""
     centers = np.stack([camera.center for camera in cameras])
     middles = np.array([[camera.width / 2, camera.height / 2, 1.0] for camera in cameras])
@@ -181,7 +181,7 @@ def look_at(cameras: list[Camera]) -> NDArray[np.float64]:
 
 def _distance_looked_at(camera: Camera, cameras: list[Camera]) -> float:
     """Depth in `camera` of the point that all cameras look at; 1 where there is no such point."""
-    distance = abs(float(camera.w2c[2, :3] @ look_at(cameras) + camera.w2c[2, 3]))
+    distance = abs(float(camera.w2c[2, :3] @ common_target(cameras) + camera.w2c[2, 3]))
     return distance if distance > 1e-6 else 1.0
 
 

@@ -1,6 +1,6 @@
 """Scenes: cameras, times, split, images and masks; reading, writing and checking them (docs/scene_format.md)."""
 
-from splashbench.scene.camera import Camera
+from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.layout import SceneMeta
@@ -16,5 +16,6 @@ __all__ = [
     "SceneMeta",
     "SignedDistance",
     "TrainingScene",
+    "look_at",
     "write_scene",
 ]

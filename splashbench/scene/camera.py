@@ -75,3 +75,21 @@ class Camera:
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
         return replace(self, width=width, height=height, K=K)
+
+
+def look_at(
+    eye: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), up: ArrayLike = (0.0, 1.0, 0.0)
+) -> NDArray[np.float64]:
+    """World-to-camera matrix [4, 4] of a camera at `eye` that looks at `target`, both [3] in scene units.
+
+    up: direction [3] that is upwards in the image. Raises ValueError where it is parallel to the view.
+    """
+    forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
+    right = np.cross(forward, up)
+    if not np.linalg.norm(right) > 0:
+        raise ValueError("the camera looks along the direction that should be up; give another up")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ np.asarray(eye, dtype=np.float64)
+    return w2c

@@ -21,7 +21,7 @@ from splashbench.container.placement import Placement, place_by_silhouettes, up_
 from splashbench.container.verification import overlay, silhouette, verify
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.session import Session
-from splashbench.scene.camera import Camera
+from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 
 Masks = dict[str, np.ndarray]
@@ -34,14 +34,8 @@ def rig(width: int = 400, height: int = 600, focal: float = 800.0) -> list[Camer
     for k, angle in enumerate(np.deg2rad(np.linspace(-38.5, 38.5, 7))):
         pitch = np.deg2rad(22)
         centre = 0.95 * np.array([np.cos(pitch) * np.sin(angle), np.sin(pitch), np.cos(pitch) * np.cos(angle)])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        w2c = np.eye(4)
-        w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        w2c[:3, 3] = -w2c[:3, :3] @ centre
         K = np.array([[focal, 0, width / 2 + 3], [0, focal, height / 2 - 5], [0, 0, 1]])
-        cameras.append(Camera(str(k + 1), width, height, K, w2c))
+        cameras.append(Camera(str(k + 1), width, height, K, look_at(centre)))
     return cameras
 
 

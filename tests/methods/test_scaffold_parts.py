@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from splashbench.background.clean_plate import CleanPlate, make_clean_plate, masked_median
-from splashbench.background.depth import depth_maps, look_at
+from splashbench.background.depth import common_target, depth_maps
 from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench.gaussians.color_loss import l1
 from splashbench.gaussians.dynamic_model import rotation_matrices
-from splashbench.scene import Camera
+from splashbench.scene import Camera, look_at
 from splashbench_methods.scaffold_gs.fitting import pyramid
 from splashbench_methods.scaffold_gs.model import AnchorModel, StaticAnchorSpec
 
@@ -23,13 +23,7 @@ def arc_camera(name: str, degrees: float, width: int = 80, height: int = 60) -> 
     """A camera on an arc of radius 5 around the origin, 25 degrees above the floor y = 0, looking at the origin."""
     angle, elevation = np.radians(degrees), np.radians(25)
     eye = 5 * np.array([np.sin(angle) * np.cos(elevation), np.sin(elevation), np.cos(angle) * np.cos(elevation)])
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 1, 0])
-    right /= np.linalg.norm(right)
-    w2c = np.eye(4)
-    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    w2c[:3, 3] = -w2c[:3, :3] @ eye
-    return Camera(name, width, height, np.array([[90.0, 0, 42], [0, 90.0, 29], [0, 0, 1]]), w2c)
+    return Camera(name, width, height, np.array([[90.0, 0, 42], [0, 90.0, 29], [0, 0, 1]]), look_at(eye))
 
 
 def floor_points(camera: Camera) -> np.ndarray:
@@ -144,7 +138,7 @@ class TestAnchors:
     def test_cameras_on_an_arc_look_at_its_centre(self):
         cameras = [arc_camera(str(d), d).cropped(2, -1, 80, 60) for d in (-30, 0, 30)]
         # Cropping moved the image centres onto the principal points, through which the optical axes run.
-        np.testing.assert_allclose(look_at(cameras), 0, atol=1e-4)
+        np.testing.assert_allclose(common_target(cameras), 0, atol=1e-4)
 
     def test_pixels_are_lifted_onto_the_plane_of_the_sparse_points(self):
         seed = seed_anchors(sparse_floor(), floor_plates(), 1500, np.random.default_rng(0))

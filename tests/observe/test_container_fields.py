@@ -9,7 +9,7 @@ import trimesh
 from splashbench.observe import Bounds, ContainerOcclusion, Grid, Silhouettes, sequence_bounds, signed_distance_fields
 from splashbench.observe.container import depth_image, hidden, solid_distance
 from splashbench.observe.occlusion import CarvingOcclusion
-from splashbench.scene import Camera, ContainerMesh
+from splashbench.scene import Camera, ContainerMesh, look_at
 
 RADIUS = 0.25
 
@@ -28,13 +28,7 @@ def nodes(grid: Grid) -> np.ndarray:
 
 def camera_at(name: str, eye: np.ndarray) -> Camera:
     """A 240x200 camera at `eye` that looks at the origin with y up."""
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    w2c = np.eye(4)
-    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    w2c[:3, 3] = -w2c[:3, :3] @ eye
-    return Camera(name, 240, 200, np.array([[400.0, 0, 120], [0, 400, 100], [0, 0, 1]]), w2c)
+    return Camera(name, 240, 200, np.array([[400.0, 0, 120], [0, 400, 100], [0, 0, 1]]), look_at(eye))
 
 
 class BallBehindAWall:

@@ -9,20 +9,14 @@ from splashbench.errors import SplashbenchError
 from splashbench.observe import Silhouettes, distrust_failed_masks, sequence_bounds, signed_distance_fields
 from splashbench.observe.failures import missing_shares
 from splashbench.observe.silhouettes import blended, signed_distance_2d
-from splashbench.scene import Camera
+from splashbench.scene import Camera, look_at
 
 FOCAL, WIDTH, HEIGHT = 260.0, 160, 120
 
 
 def camera_at(name: str, angle: float) -> Camera:
     eye = np.array([2.5 * np.cos(angle), 0.8, 2.5 * np.sin(angle)])
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    w2c = np.eye(4)
-    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    w2c[:3, 3] = -w2c[:3, :3] @ eye
-    return Camera(name, WIDTH, HEIGHT, np.array([[FOCAL, 0, 80], [0, FOCAL, 60], [0, 0, 1]]), w2c)
+    return Camera(name, WIDTH, HEIGHT, np.array([[FOCAL, 0, 80], [0, FOCAL, 60], [0, 0, 1]]), look_at(eye))
 
 
 class MovingBall:

@@ -14,20 +14,14 @@ from splashbench.observe import Bounds, Grid, Silhouettes, sequence_bounds, sign
 from splashbench.observe.kernels import resample, sample
 from splashbench.observe.signed_distance import signed_distance_of
 from splashbench.observe.silhouettes import signed_distance_2d
-from splashbench.scene.camera import Camera
+from splashbench.scene.camera import Camera, look_at
 
 RADIUS = 0.25
 
 
 def looking_at_origin(name: str, eye: np.ndarray, focal: float = 400.0) -> Camera:
     """A 240x200 camera at `eye` that looks at the origin with y up."""
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = rotation, -rotation @ eye
-    return Camera(name, 240, 200, np.array([[focal, 0, 120], [0, focal, 100], [0, 0, 1.0]]), w2c)
+    return Camera(name, 240, 200, np.array([[focal, 0, 120], [0, focal, 100], [0, 0, 1.0]]), look_at(eye))
 
 
 class Ball:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splashbench.scene import Camera
+from splashbench.scene import Camera, look_at
 
 K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
 
@@ -46,3 +46,16 @@ def test_the_centre_is_where_the_camera_stands() -> None:
 def test_what_is_no_rigid_pose_is_refused(bad: np.ndarray) -> None:
     with pytest.raises(ValueError, match="camera 3"):
         Camera("3", 100, 80, K, bad)
+
+
+def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_up_is_up():
+    eye, target = np.array([1.0, 2.0, -3.0]), np.array([0.2, 0.5, 0.1])
+    camera = Camera("1", 200, 100, np.array([[150.0, 0, 100], [0, 150, 50], [0, 0, 1]]), look_at(eye, target))
+    np.testing.assert_allclose(camera.center, eye, atol=1e-12)
+    pixels, depth = camera.project([target, target + np.array([0, 0.1, 0])])
+    np.testing.assert_allclose(pixels[0], [100, 50], atol=1e-9)
+    assert depth[0] == pytest.approx(np.linalg.norm(target - eye))
+    assert pixels[1, 1] < 50  # rows count downwards
+    assert pixels[1, 0] == pytest.approx(100)
+    with pytest.raises(ValueError, match="another up"):
+        look_at(eye, eye + np.array([0, 1, 0]))

@@ -10,7 +10,7 @@ from splashbench.observe.container import depth_image
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_frame
 from splashbench.observe.occlusion import ContainerOcclusion
-from splashbench.scene.camera import Camera
+from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench_methods.splashsplat.carriers.visibility import seen_by_any
 from splashbench_methods.splashsplat.fields.gravity_cues import gravity_cues
@@ -29,14 +29,8 @@ VOXEL = 0.005
 
 def looking_at(name: str, eye: np.ndarray, target: np.ndarray, size: tuple[int, int] = (160, 120)) -> Camera:
     """A pinhole camera at `eye` looking at `target`, y of the world up."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = rotation, -rotation @ eye
     K = np.array([[1.2 * size[0], 0, size[0] / 2], [0, 1.2 * size[0], size[1] / 2], [0, 0, 1.0]])
-    return Camera(name, *size, K, w2c)
+    return Camera(name, *size, K, look_at(eye, target))
 
 
 def rig(target: np.ndarray, distance: float = 1.0, elevation: float = 30.0) -> dict[str, Camera]:

@@ -21,6 +21,7 @@ from splashbench.prepare.poses.metric import Sighting, align, initial_points, tr
 from splashbench.prepare.poses.rig import find_poses, sight_prints
 from splashbench.prepare.poses.structure_from_motion import Poses, estimate_poses
 from splashbench.prepare.session_tables import Board
+from splashbench.scene import look_at
 
 WIDTH, HEIGHT = 400, 225
 BOARD = Board(squares_x=8, squares_y=5, square_metres=0.05, marker_metres=0.0375, dictionary="DICT_4X4_50")
@@ -120,14 +121,7 @@ def look(azimuth_degrees: float, elevation_degrees: float, radius: float) -> np.
     """World-to-camera [4, 4] of a camera that looks at a point just above the table's middle."""
     a, e = np.radians([azimuth_degrees, elevation_degrees])
     eye = radius * np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
-    z = np.array([0.0, 0.03, 0.0]) - eye
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    w2c = np.eye(4)
-    w2c[:3, :3] = np.stack([x, np.cross(z, x), z])
-    w2c[:3, 3] = -w2c[:3, :3] @ eye
-    return w2c
+    return look_at(eye, (0.0, 0.03, 0.0))
 
 
 def make_lens(focal: float, k1: float, zoom: float = 1) -> Lens:

@@ -20,6 +20,7 @@ from splashbench.prepare.poses.metric import MetricFrame, Print, Sighting, agree
 from splashbench.prepare.poses.scale import SceneFrame, Upright, choose_frame, distance_scale, rescaled, scene_frame
 from splashbench.prepare.poses.structure_from_motion import Poses
 from splashbench.prepare.session_tables import Board, Distance, Marker
+from splashbench.scene import look_at
 
 WIDTH, HEIGHT = 1200, 800
 SIDE = 0.12
@@ -35,13 +36,7 @@ def look(azimuth: float) -> np.ndarray:
     """World-to-camera of a camera one metre from the origin, 30 degrees above the table, metres and y up."""
     a, e = np.radians([azimuth, 30])
     eye = np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    w2c = np.eye(4)
-    w2c[:3, :3] = np.stack([x, np.cross(z, x), z])
-    w2c[:3, 3] = -w2c[:3, :3] @ eye
-    return w2c
+    return look_at(eye)
 
 
 TRUE = {camera: look(azimuth) for camera, azimuth in AZIMUTHS.items()}
