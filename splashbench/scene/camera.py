@@ -85,7 +85,7 @@ def look_at(
     up: direction [3] that is upwards in the image. Raises ValueError where it is parallel to the view.
     """
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
-    right = np.cross(forward, up)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if not np.linalg.norm(right) > 0:
         raise ValueError("the camera looks along the direction that should be up; give another up")
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
