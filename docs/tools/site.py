@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
@@ -29,6 +30,7 @@ _OUTSIDE = {
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 _SCRIPT = re.compile(r"^\[[^\]]*\]\([./]*(examples/\w+\.py)\)$", re.MULTILINE)
 _SOURCE = re.compile(r'(src=")([^"]+)(")')
+_LOAD = re.compile(r"<(?:script|img|iframe|link)\b[^>]*(?:src|href)=[\"']?((?:https?:)?//[^\"'\s>]+)")
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
@@ -67,6 +69,14 @@ def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
         return str(convert(escaping.unescape(match[2]).strip(), display=display))
 
     return _FORMULA.sub(drawn, html)
+
+
+def on_post_page(output: str, page: Any, config: Any) -> str:
+    """Refuse a page that loads something from the network: the site works without."""
+    loads = _LOAD.findall(output)
+    if loads:
+        raise PluginError(f"{page.file.src_uri} loads {loads[0]} from the network")
+    return output
 
 
 def rewritten(text: str, path: str, page: str, root: Path = ROOT) -> str:

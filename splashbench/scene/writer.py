@@ -32,7 +32,8 @@ def write_scene(
 
     Args:
         cameras: name -> Camera, of the images as written.
-        train, test: camera names of the split.
+        train: camera names of the training split.
+        test: camera names of the test split.
         n_frames: number of timesteps T.
         frames: yields (camera, t, image uint8 [H, W, 3], liquid mask [H, W]) once for each shown camera and timestep.
         meta: scene.json; its `sizes` are filled in here.
