@@ -21,7 +21,7 @@ from splashbench.harness.contract import Method
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.messages import Outcome, Request
 from splashbench.harness.process import Watched, watch
-from splashbench.harness.training_copy import make_training_view
+from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
 from splashbench.submission.withheld import Withheld, kept_timesteps
@@ -103,7 +103,7 @@ def run_method(
             Request(
                 phase="fit",
                 method=name,
-                scene=str(make_training_view(scene, Path(scratch, "scene"), kept_timesteps(scene.n_frames, withheld))),
+                scene=str(make_training_copy(scene, Path(scratch, "scene"), kept_timesteps(scene.n_frames, withheld))),
                 preset=preset,
                 overrides=dict(overrides or {}),
                 seed=seed,

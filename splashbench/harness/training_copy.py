@@ -18,8 +18,8 @@ from splashbench.scene.layout import plain_name
 from splashbench.scene.source import RELEASED_FILES, ReleasedSource
 
 
-def make_training_view(scene: Scene, directory: Path, kept: Sequence[int] | None = None) -> Path:
-    """Write the training view of `scene` into `directory` (made here) and return it.
+def make_training_copy(scene: Scene, directory: Path, kept: Sequence[int] | None = None) -> Path:
+    """Write the training copy of `scene` into `directory` (made here) and return it.
 
     kept: the timesteps that it has, in order; all of them by default.
     """
@@ -59,14 +59,14 @@ def _shown_meta(scene: Scene, kept: Sequence[int]) -> SceneMeta:
     """What a method is told of `scene` on the timesteps `kept`: nothing of where it came from."""
     meta = scene.meta or SceneMeta(name=plain_name(scene.name))
     if meta.container_mesh is not None:
-        # Under a name of its own: made-up scenes keep it beside the truth, which a method is not shown.
+        # Under a name of its own: synthetic scenes keep it beside the truth, which a method is not shown.
         suffix = mesh_path(scene.directory, meta.container_mesh).suffix.lower()
         meta = meta.model_copy(update={"container_mesh": f"container{suffix}"})
     sizes = {name: (camera.width, camera.height) for name, camera in scene.cameras.items()}
-    whole = len(kept) == scene.n_frames
-    times = scene.times[list(kept)].tolist() if scene.times_source != "nominal" or not whole else None
-    own = meta.camera_times and {name: [known[t] for t in kept] for name, known in meta.camera_times.items()}
-    return meta.model_copy(update={"sizes": sizes, "times": times, "camera_times": own, "provenance": {}})
+    complete = len(kept) == scene.n_frames
+    times = scene.times[list(kept)].tolist() if scene.times_source != "nominal" or not complete else None
+    camera_times = meta.camera_times and {name: [values[t] for t in kept] for name, values in meta.camera_times.items()}
+    return meta.model_copy(update={"sizes": sizes, "times": times, "camera_times": camera_times, "provenance": {}})
 
 
 def _link_extras(scene: Scene, directory: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from splashbench.cli.main import main
 from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.harness.runner import run_method
-from splashbench.harness.training_copy import make_training_view
+from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Camera, Particles, Scene, TrainingScene
 from splashbench.score import score_submission
 from splashbench.submission.withheld import kept_timesteps, scored_timesteps
@@ -56,7 +56,7 @@ def test_which_timesteps() -> None:
 
 
 def test_the_method_sees_every_second_timestep_and_nothing_of_the_others(balls: Scene, tmp_path: Path) -> None:
-    view = Scene.open(make_training_view(balls, tmp_path / "view", (0, 2, 4, 6)))
+    view = Scene.open(make_training_copy(balls, tmp_path / "view", (0, 2, 4, 6)))
     assert view.frames == balls.frames[::2]
     np.testing.assert_array_equal(view.times, balls.times[::2])
     for name in balls.train:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from splashbench.errors import SplashbenchError
-from splashbench.harness.training_copy import make_training_view
+from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import ContainerMesh, Scene
 from splashbench.scene.container import read_mesh
 from splashbench.synth.imaging.geometry import bowl_mesh
@@ -108,7 +108,7 @@ def test_a_scene_places_its_mesh_and_a_method_sees_it(balls_copy: Path, tmp_path
     mesh = scene.container_mesh()
     assert mesh is not None
     np.testing.assert_allclose(mesh.vertices.max(axis=0), 2 * bowl.vertices.max(axis=0) + [1, 2, 3], rtol=1e-5)
-    shown = make_training_view(scene, tmp_path / "view")
+    shown = make_training_copy(scene, tmp_path / "view")
     assert not (shown / "truth").exists()
     seen = Scene.open(shown).training().container_mesh()
     assert seen is not None

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from splashbench.errors import SplashbenchError
-from splashbench.harness.training_copy import make_training_view
+from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Scene
 from splashbench.scene.inspection import check_scene, describe_scene
 from splashbench.study.scenes import changed_scene
@@ -49,7 +49,7 @@ def test_any_folder_name_gives_a_scene_that_runs(watersphere_copy: Path, tmp_pat
         assert scene.name == known
         # Not the released scene of that name: neither its times nor its units.
         assert (scene.times_source, scene.is_released) == ("neurofluid", False)
-        make_training_view(scene, tmp_path / f"view of {known}")
+        make_training_copy(scene, tmp_path / f"view of {known}")
         watersphere_copy = folder
 
 
@@ -188,7 +188,7 @@ def test_the_digest_of_the_truth_covers_every_frame(watersphere_copy: Path) -> N
 
 def test_a_methods_copy_has_the_training_views_alone(watersphere: Path, tmp_path: Path) -> None:
     scene = Scene.open(watersphere)
-    shown = Scene.open(make_training_view(scene, tmp_path / "view"))
+    shown = Scene.open(make_training_copy(scene, tmp_path / "view"))
     assert shown.layout == "released"
     for t in range(scene.n_frames):
         for name in scene.train:

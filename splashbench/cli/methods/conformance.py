@@ -47,8 +47,7 @@ def register(actions: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench methods test`."""
-    from splashbench.harness.conformance import conform
-    from splashbench.harness.conformance.conform import TIMEOUT_SECONDS
+    from splashbench.harness.conformance import TIMEOUT_SECONDS, conform
     from splashbench.harness.runner import parse_overrides
 
     report = conform(

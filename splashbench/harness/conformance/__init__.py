@@ -1,5 +1,9 @@
-"""Does a method keep the contract? Its conformance test, `splashbench methods test` (docs/conformance.md)."""
+"""Does a method keep the contract? Its conformance test, `splashbench methods test` (docs/conformance.md).
 
-from splashbench.harness.conformance.conform import Finding, Report, Verdict, conform
+`suite` has the checks in order. They are in `model`, `scene_access` and `stopping`, and look at the runs of `evidence`.
+"""
 
-__all__ = ["Finding", "Report", "Verdict", "conform"]
+from splashbench.harness.conformance.report import Finding, Report, Verdict
+from splashbench.harness.conformance.suite import TIMEOUT_SECONDS, conform
+
+__all__ = ["TIMEOUT_SECONDS", "Finding", "Report", "Verdict", "conform"]

@@ -1,31 +1,51 @@
-"""The views that a fitted model is asked for, and the digests of what it renders."""
+"""The views that a fitted model is asked for, and digests of what it renders and returns."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict
 
-from splashbench.harness.conformance.messages import Held, Kind, Seen
 from splashbench.harness.contract import Fitted, Render
 from splashbench.harness.messages import Failure
 from splashbench.harness.output_checks import check_geometry, check_particles, checked_render
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
 
+#: What a view is asked for: as in a run, between the timesteps, at another size, through a window of a view.
+Kind = Literal["test", "between", "size", "window"]
 #: Of the times between timesteps, at most so many, evenly chosen.
-_MOST_BETWEEN = 16
+_MAX_BETWEEN = 16
 #: How far outside the scene's interval a view is asked for, in steps: a test camera's clock may run that much ahead.
 _OUTSIDE = 0.25
-# Differences of 8-bit images that a resampled window may have.
+#: Difference of 8-bit images that a resampled window may have.
 _ROUNDING = 2 / 255
 
 
+class RenderedView(BaseModel):
+    """One view as rendered: SHA-256 of its pixels, or what is wrong with it."""
+
+    model_config = ConfigDict(extra="forbid")
+    kind: Kind
+    digest: str = ""
+    fault: str = ""
+
+
+class ReturnedArrays(BaseModel):
+    """Particles or signed distance as returned: SHA-256 of the arrays, what they are, or what is wrong with them."""
+
+    model_config = ConfigDict(extra="forbid")
+    digest: str = ""
+    about: str = ""
+    fault: str = ""
+
+
 @dataclass(frozen=True)
-class View:
+class ViewRequest:
     """A camera at a time (seconds), under a name for the user."""
 
     kind: Kind
@@ -34,28 +54,33 @@ class View:
     time: float
 
 
-def views_of(scene: TrainingScene) -> list[View]:
-    """Every test view at every timestep; the first test camera between the timesteps and a little outside of them, at
-    two other sizes, and through a window whose principal point is far from its middle."""
-    views = [
-        View("test", f"camera {name}, timestep {t}", camera, float(scene.camera_times[name][t]))
+def requests_of(scene: TrainingScene) -> list[ViewRequest]:
+    """Every test view at every timestep, and the first test camera in unusual ways.
+
+    These are times between the timesteps and a little outside of them, two other sizes, and a window whose principal
+    point is far from its middle.
+    """
+    requests = [
+        ViewRequest("test", f"camera {name}, timestep {t}", camera, float(scene.camera_times[name][t]))
         for name, camera in scene.test_cameras.items()
         for t in range(scene.n_frames)
     ]
     camera, times = next(iter(scene.test_cameras.values())), scene.times
     if len(times) > 1:
         between = (times[1:] + times[:-1]) / 2
-        chosen = np.unique(np.linspace(0, len(between) - 1, min(len(between), _MOST_BETWEEN)).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(between) - 1, min(len(between), _MAX_BETWEEN)).round().astype(int))
         outside = (times[0] - _OUTSIDE * (times[1] - times[0]), times[-1] + _OUTSIDE * (times[-1] - times[-2]))
-        views += [
-            View("between", f"camera {camera.name} at {time:.6g} s", camera, float(time))
+        requests += [
+            ViewRequest("between", f"camera {camera.name} at {time:.6g} s", camera, float(time))
             for time in (outside[0], *between[chosen], outside[1])
         ]
     time = middle(scene)
     for other in (resized(camera, 0.61, 1.27), resized(camera, 1.5, 1.5)):
-        views.append(View("size", f"camera {camera.name} at {other.width}x{other.height} pixels", other, time))
-    views.append(View("window", f"a window of camera {camera.name}", window(camera)[2], time))
-    return views
+        requests.append(
+            ViewRequest("size", f"camera {camera.name} at {other.width}x{other.height} pixels", other, time)
+        )
+    requests.append(ViewRequest("window", f"a window of camera {camera.name}", window(camera)[2], time))
+    return requests
 
 
 def middle(scene: TrainingScene) -> float:
@@ -77,26 +102,27 @@ def window(camera: Camera) -> tuple[int, int, Camera]:
     return x0, y0, camera.cropped(x0, y0, width, height)
 
 
-def look(fitted: Fitted, views: Iterable[View]) -> dict[str, Seen]:
-    """Render `views` in this order: name -> digest, or fault."""
-    return {view.name: _seen(fitted, view) for view in views}
+def rendered_views(fitted: Fitted, requests: Iterable[ViewRequest]) -> dict[str, RenderedView]:
+    """Render `requests` in this order: name -> digest, or fault."""
+    return {request.name: _rendered(fitted, request) for request in requests}
 
 
-def _seen(fitted: Fitted, view: View) -> Seen:
+def _rendered(fitted: Fitted, request: ViewRequest) -> RenderedView:
+    kind, name, camera = request.kind, request.name, request.camera
     try:
-        render = checked_render(fitted.render(view.camera, view.time), view.camera, view.name)
+        render = checked_render(fitted.render(camera, request.time), camera, name)
     except Failure as failure:
-        return Seen(kind=view.kind, fault=str(failure))
+        return RenderedView(kind=kind, fault=str(failure))
     except Exception as error:
-        return Seen(kind=view.kind, fault=f"{view.name}: render() raised {type(error).__name__}: {error}"[:300])
-    return Seen(kind=view.kind, digest=digest(render.rgb, render.alpha))
+        return RenderedView(kind=kind, fault=f"{name}: render() raised {type(error).__name__}: {error}"[:300])
+    return RenderedView(kind=kind, digest=digest(render.rgb, render.alpha))
 
 
 def digest(*arrays: ArrayLike | None) -> str:
     """SHA-256 of types, shapes and bytes."""
     total = hashlib.sha256()
-    for given in arrays:
-        array = np.asarray(given if given is not None else [])
+    for values in arrays:
+        array = np.asarray(values if values is not None else [])
         total.update(f"{array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
 
@@ -109,15 +135,15 @@ def window_fault(fitted: Fitted, scene: TrainingScene) -> str:
     """
     camera = next(iter(scene.test_cameras.values()))
     x0, y0, part = window(camera)
-    whole, shown = (_pixels(fitted.render(view, middle(scene))) for view in (camera, part))
-    if whole.shape[:2] != (camera.height, camera.width) or shown.shape[:2] != (part.height, part.width):
-        return ""  # told as a wrong size
-    own = _difference(whole, shown, x0, y0)
+    full, cropped = (_pixels(fitted.render(view, middle(scene))) for view in (camera, part))
+    if full.shape[:2] != (camera.height, camera.width) or cropped.shape[:2] != (part.height, part.width):
+        return ""  # reported as a wrong size
+    difference = _difference(full, cropped, x0, y0)
     centred = [
-        _difference(whole, shown, round(x - part.width / 2), round(y - part.height / 2))
+        _difference(full, cropped, round(x - part.width / 2), round(y - part.height / 2))
         for x, y in ((camera.K[0, 2], camera.K[1, 2]), (camera.width / 2, camera.height / 2))
     ]
-    if own <= max(_ROUNDING, min(centred)):
+    if difference <= max(_ROUNDING, min(centred)):
         return ""
     return (
         f"camera {camera.name} through the window of {part.width}x{part.height} pixels at ({x0}, {y0}) shows the part "
@@ -130,46 +156,46 @@ def _pixels(render: Render) -> NDArray[np.float64]:
     return np.concatenate([np.asarray(render.rgb), np.asarray(render.alpha)[..., None]], axis=-1).astype(np.float64)
 
 
-def _difference(whole: NDArray[np.float64], shown: NDArray[np.float64], x0: int, y0: int) -> float:
-    """Mean difference of `shown` and the part of `whole` whose left top pixel is (x0, y0); infinite where none is."""
-    height, width = shown.shape[:2]
-    if min(x0, y0) < 0 or y0 + height > whole.shape[0] or x0 + width > whole.shape[1]:
+def _difference(full: NDArray[np.float64], cropped: NDArray[np.float64], x0: int, y0: int) -> float:
+    """Mean difference of `cropped` and the part of `full` whose left top pixel is (x0, y0); infinite where none is."""
+    height, width = cropped.shape[:2]
+    if min(x0, y0) < 0 or y0 + height > full.shape[0] or x0 + width > full.shape[1]:
         return float("inf")
-    return float(np.abs(whole[y0 : y0 + height, x0 : x0 + width] - shown).mean())
+    return float(np.abs(full[y0 : y0 + height, x0 : x0 + width] - cropped).mean())
 
 
-def held_particles(fitted: Fitted, n_frames: int) -> Held:
+def returned_particles(fitted: Fitted, n_frames: int) -> ReturnedArrays:
     """The particles' digest, or fault."""
 
-    def told(particles: Particles) -> Held:
+    def described(particles: Particles) -> ReturnedArrays:
         check_particles(particles, n_frames)
-        return Held(
+        return ReturnedArrays(
             digest=digest(particles.positions, particles.active, particles.velocities),
             about=f"{particles.positions.shape[1]} particles at {n_frames} timesteps",
         )
 
-    return _held(fitted, "particles", told)
+    return _returned(fitted, "particles", described)
 
 
-def held_geometry(fitted: Fitted, n_frames: int) -> Held:
+def returned_geometry(fitted: Fitted, n_frames: int) -> ReturnedArrays:
     """The signed distance's digest, or fault."""
 
-    def told(geometry: SignedDistance) -> Held:
+    def described(geometry: SignedDistance) -> ReturnedArrays:
         check_geometry(geometry, n_frames)
-        return Held(
+        return ReturnedArrays(
             digest=digest(geometry.phi, geometry.origin, geometry.voxel),
             about="grids of " + "x".join(map(str, geometry.phi.shape[1:])),
         )
 
-    return _held(fitted, "signed_distance", told)
+    return _returned(fitted, "signed_distance", described)
 
 
-def _held(fitted: Fitted, name: str, told: Callable[[Any], Held]) -> Held:
-    """What `told` says of what the method `name` returns, and as a fault whatever either raises."""
+def _returned(fitted: Fitted, name: str, described: Callable[[Any], ReturnedArrays]) -> ReturnedArrays:
+    """`described` of what the function `name` returns; whatever either raises is a fault."""
     try:
-        given = getattr(fitted, name)()
-        return Held(about="none") if given is None else told(given)
+        arrays = getattr(fitted, name)()
+        return ReturnedArrays(about="none") if arrays is None else described(arrays)
     except Failure as failure:
-        return Held(fault=str(failure))
+        return ReturnedArrays(fault=str(failure))
     except Exception as error:
-        return Held(fault=f"{name}() raised {type(error).__name__}: {error}"[:300])
+        return ReturnedArrays(fault=f"{name}() raised {type(error).__name__}: {error}"[:300])

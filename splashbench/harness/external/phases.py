@@ -18,7 +18,7 @@ from splashbench.harness.external.commands import command_line
 from splashbench.harness.messages import Failure, Request
 from splashbench.harness.process import Watched, watch
 from splashbench.harness.runner import particles_per_frame, run_phase
-from splashbench.harness.training_copy import make_training_view
+from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Scene
 from splashbench.scene.export import TEST_VIEWS, InitialPoints, export_scene
 from splashbench.submission import Record, Status
@@ -149,7 +149,7 @@ class ExternalRun:
         request = Request(
             phase="import",
             method=self.code.name,
-            scene=str(make_training_view(self.scene, self.scratch / "training")),
+            scene=str(make_training_copy(self.scene, self.scratch / "training")),
             preset="",
             overrides={},
             seed=self.seed,

@@ -26,6 +26,7 @@ class Sky(Method):
     """Colours every pixel by the direction of its ray: a seeded pattern in the mean colour of the training views."""
 
     id, title, Config = "sky", "a sky", Settings
+    Model: ClassVar[type]
 
     def fit(self, scene: TrainingScene, config: Settings, run: Run) -> "Model":
         for step in range(config.steps):
@@ -40,7 +41,7 @@ class Sky(Method):
         return np.random.default_rng(run.seed)
 
     def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> "Model":
-        return Model(mean, phase, scene.n_frames)
+        return self.Model(mean, phase, scene.n_frames)
 
     def load(self, directory: Path, scene: TrainingScene) -> "Model":
         with np.load(directory / "model.npz", allow_pickle=False) as data:
@@ -62,6 +63,9 @@ class Model(Fitted):
 
     def save(self, directory: Path) -> None:
         np.savez(directory / "model.npz", mean=self.mean, phase=self.phase)
+
+
+Sky.Model = Model
 
 
 # --- metadata
@@ -117,9 +121,6 @@ class Pickles(Sky):
             with (directory / "model").open("wb") as stream:
                 pickle.dump((self.mean, self.phase), stream)
 
-    def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> Model:
-        return self.Model(mean, phase, scene.n_frames)
-
     def load(self, directory: Path, scene: TrainingScene) -> Model:
         with (directory / "model").open("rb") as stream:
             return self.model(*pickle.load(stream), scene)
@@ -129,9 +130,6 @@ class Rounds(Sky):
     class Model(Model):
         def save(self, directory: Path) -> None:
             np.savez(directory / "model.npz", mean=self.mean.astype(np.float16), phase=self.phase)
-
-    def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> Model:
-        return self.Model(mean, phase, scene.n_frames)
 
 
 class SavesElsewhere(Sky):
@@ -191,9 +189,6 @@ class Centred(Sky):
             K[:2, 2] = camera.width / 2, camera.height / 2
             return super().render(Camera(camera.name, camera.width, camera.height, K, camera.w2c), time)
 
-    def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> Model:
-        return self.Model(mean, phase, scene.n_frames)
-
 
 class FramesOnly(Sky):
     """Knows nothing between the timesteps."""
@@ -218,9 +213,6 @@ class NotANumber(Sky):
             render.rgb[3, 4, 1] = np.nan
             return render
 
-    def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> Model:
-        return self.Model(mean, phase, scene.n_frames)
-
 
 class FewParticles(Sky):
     def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> Model:
@@ -231,9 +223,6 @@ class PhiAsAnArray(Sky):
     class Model(Model):
         def signed_distance(self) -> None:
             return np.zeros((4, 4, 4))  # type: ignore[return-value]
-
-    def model(self, mean: np.ndarray, phase: np.ndarray, scene: TrainingScene) -> Model:
-        return self.Model(mean, phase, scene.n_frames)
 
 
 # --- seeds

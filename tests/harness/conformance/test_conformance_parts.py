@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splashbench.harness.conformance.opening import Opening
-from splashbench.harness.conformance.scenes import empty_masks, hidden, keep_first_frame
-from splashbench.harness.conformance.stop_checks import signal_faults
-from splashbench.harness.conformance.stopping import Stopped, as_pairs
-from splashbench.harness.conformance.stored import storage_faults
+from splashbench.harness.conformance.recording import OpeningWatch
+from splashbench.harness.conformance.scene_copies import empty_masks, hidden, keep_first_frame
+from splashbench.harness.conformance.stopping import StoppedRun, as_pairs, signal_faults
+from splashbench.harness.conformance.storage import storage_faults
 from splashbench.harness.runner import parse_overrides
 from splashbench.scene import Scene
 
@@ -66,32 +65,32 @@ def test_openings_are_seen_from_any_process(tmp_path: Path) -> None:
     for path in files.values():
         path.write_text("text")
     watched = [files[name] for name in ("read", "native", "unread")]
-    with Opening(watched) as opening:
+    with OpeningWatch(watched) as openings:
         files["read"].read_text()
         files["other"].read_text()
         files["unread"].stat()
         subprocess.run(["cat", str(files["native"])], stdout=subprocess.DEVNULL, check=True)
-    if not opening.complete:
+    if not openings.complete:
         pytest.skip("this system has no inotify")
-    assert opening.seen == [files["native"], files["read"]]
-    with Opening(watched) as opening:
+    assert openings.opened == [files["native"], files["read"]]
+    with OpeningWatch(watched) as openings:
         assert len(list((tmp_path / "folder").iterdir())) == 4
-    assert opening.seen == [tmp_path / "folder"]
+    assert openings.opened == [tmp_path / "folder"]
     files["read"].read_text()
-    assert opening.seen == [tmp_path / "folder"]
+    assert openings.opened == [tmp_path / "folder"]
 
 
 def test_hiding_leaves_a_method_what_it_may_see(balls_copy: Path, balls: Scene, tmp_path: Path) -> None:
-    place = hidden(balls_copy, tmp_path / "place")
-    told = {path.relative_to(balls_copy).as_posix() for path in place.baits}
-    assert "truth/particles.npz" in told
-    assert {f"{kind}/6/000003.png" for kind in ("ims", "seg")} <= told
-    assert not any(name.split("/")[1] in balls.train for name in told)
-    assert all(path.read_bytes().startswith(b"This is a test view") for path in place.baits)
-    view = Scene.open(place.view).training()
+    copy = hidden(balls_copy, tmp_path / "copy")
+    baits = {path.relative_to(balls_copy).as_posix() for path in copy.baits}
+    assert "truth/particles.npz" in baits
+    assert {f"{kind}/6/000003.png" for kind in ("ims", "seg")} <= baits
+    assert not any(name.split("/")[1] in balls.train for name in baits)
+    assert all(path.read_bytes().startswith(b"This is a test view") for path in copy.baits)
+    training = Scene.open(copy.training).training()
     for name in balls.train:
-        assert (view.image(name, 3) == balls.image(name, 3)).all()
-        assert (view.mask(name, 3) == balls.mask(name, 3)).all()
+        assert (training.image(name, 3) == balls.image(name, 3)).all()
+        assert (training.mask(name, 3) == balls.mask(name, 3)).all()
 
 
 def test_scenes_at_the_edge(balls_copy: Path, balls: Scene) -> None:
@@ -106,11 +105,11 @@ def test_scenes_at_the_edge(balls_copy: Path, balls: Scene) -> None:
 
 def test_what_a_stopped_run_must_not_leave(tmp_path: Path) -> None:
     out = tmp_path / "submission"
-    good = Stopped(held=True, exit_code=143, said="interrupted", seconds=0.1)
+    good = StoppedRun(paused=True, exit_code=143, last_line="interrupted")
     assert signal_faults(good, signal.SIGTERM, out) == []
     assert signal_faults(good, signal.SIGINT, out) == ["exit status 143: interrupted"]
-    assert signal_faults(Stopped(True, None, "", 20.0), signal.SIGINT, out) == ["the run did not end"]
-    early = Stopped(held=False, exit_code=0, said="ok", seconds=0.1)
+    assert signal_faults(StoppedRun(True, None, ""), signal.SIGINT, out) == ["the run did not end"]
+    early = StoppedRun(paused=False, exit_code=0, last_line="ok")
     assert signal_faults(early, signal.SIGTERM, out) == ["the fit did not get to its middle: ok"]
     (tmp_path / ".tmp-12345678-submission").mkdir()
     assert signal_faults(good, signal.SIGTERM, out) == [".tmp-12345678-submission was left beside the submission"]

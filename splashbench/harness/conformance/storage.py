@@ -1,4 +1,4 @@
-"""What a method saved, looked over: no pickles, which run code when they are read, and nothing but plain files."""
+"""The files that a method saved: plain files alone, and no pickles, which run code when they are read."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _FIRST, _LAST = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"), b"."
 def storage_faults(directory: Path) -> list[str]:
     """A line for each fault of the files that `Fitted.save` wrote into `directory`.
 
-    A pickle is told by its name, by its first and last bytes (protocols 2 to 5), inside zip archives (what torch.save
-    writes), and by arrays of objects in .npy and .npz. Not told: pickles in a compression of the method's own.
+    A pickle shows by its name, by its first and last bytes (protocols 2 to 5), inside zip archives (what torch.save
+    writes), and by arrays of objects in .npy and .npz. Not noticed: pickles in a compression of the method's own.
     """
     faults, files = [], 0
     for root, folders, names in os.walk(directory):

@@ -1,22 +1,20 @@
-"""The evidence of a conformance test: runs of the method, each made when a check asks for it, and then kept."""
+"""The evidence of a conformance test: runs of the method, each made when a check first asks for it."""
 
 from __future__ import annotations
 
-import signal
-import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from splashbench.errors import DiskFullError, SplashbenchError
-from splashbench.harness.conformance import scenes
+from splashbench.harness.conformance import scene_copies
 from splashbench.harness.conformance.bench import Bench
-from splashbench.harness.conformance.messages import Answer, Subject
-from splashbench.harness.conformance.stopping import Stopped, as_pairs, stop_run
+from splashbench.harness.conformance.report import NotTested
+from splashbench.harness.conformance.scene_copies import SceneCopy
+from splashbench.harness.conformance.subject import Answer, Subject
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.runner import run_method
 from splashbench.scene import Scene
@@ -24,29 +22,33 @@ from splashbench.submission import Status, check_submission
 from splashbench.synth.balls import write_balls_scene
 
 SEED, OTHER_SEED = 0, 1
-#: Allowed to a process for starting, on top of half a fit, before its time limit is up.
-STARTING_SECONDS = 3.0
 #: The preset for trying a method, where it has one of this name.
 _QUICK = "quick"
 
 
 @dataclass
-class Ran:
-    """An ordinary run through the harness: its status, why, and the model that it kept."""
+class OrdinaryRun:
+    """A run through the harness: its status and reason, and the model that it left. seconds: rendering included."""
 
     status: str
     reason: str
     fit_seconds: float
-    seconds: float  # with starting, rendering and writing
+    seconds: float
     model: Path
 
+    @property
+    def ok(self) -> bool:
+        return self.status == Status.OK.value
 
-class Trial:
-    """One method with settings on one scene. Use `trial`.
+
+class Evidence:
+    """What one method with settings does on one scene.
 
     Attributes:
         name, method, preset, overrides, config: the method as the user gave it, and with what settings.
         bench: where its processes run, and what they were seen to do.
+
+    Raises SplashbenchError where there is no such method, preset, setting, device or scene.
     """
 
     def __init__(
@@ -69,8 +71,8 @@ class Trial:
         self.overrides = dict(overrides)
         self.config = self.method.Config.preset(self.preset, self.overrides)
         if device not in self.method.devices:
-            known = ", ".join(self.method.devices)
-            raise SplashbenchError(f"method {self.method.id} runs on {known}, not on {device!r}; leave --device out")
+            devices = ", ".join(self.method.devices)
+            raise SplashbenchError(f"method {self.method.id} runs on {devices}, not on {device!r}; leave --device out")
         self.device, self.timeout_seconds = device, timeout_seconds
         self.bench, self._source = Bench(work), scene
         self._subject = Subject(
@@ -82,22 +84,22 @@ class Trial:
             timeout_seconds=timeout_seconds,
         )
         if scene is not None:
-            _ = Scene.open(scene).digest  # whatever is missing is told by the name that the user knows
+            _ = Scene.open(scene).digest  # whatever is missing is named as the user knows it
 
     @cached_property
     def small(self) -> Path:
-        """The made-up scene of balls."""
+        """The synthetic scene of balls."""
         return write_balls_scene(self.bench.folder("small") / "balls").directory
 
     @cached_property
-    def ordinary(self) -> scenes.Place:
+    def ordinary(self) -> SceneCopy:
         """The scene as it is."""
-        return scenes.ordinary(self._copy(self._source or self.small, "scene"), self.bench.folder("scene"))
+        return scene_copies.ordinary(self._copy(self._source or self.small, "scene"), self.bench.folder("scene"))
 
     @cached_property
-    def hidden(self) -> scenes.Place:
+    def hidden(self) -> SceneCopy:
         """The scene with test views and truth made unreadable."""
-        return scenes.hidden(self._copy(self._source or self.small, "hidden"), self.bench.folder("hidden"))
+        return scene_copies.hidden(self._copy(self._source or self.small, "hidden"), self.bench.folder("hidden"))
 
     @cached_property
     def before(self) -> dict[str, str]:
@@ -108,16 +110,16 @@ class Trial:
         """Contents of both scenes now."""
         return {
             f"{kind} {name}": digest
-            for kind, place in (("scene", self.ordinary), ("hidden", self.hidden))
-            for name, digest in place.contents().items()
+            for kind, copy in (("scene", self.ordinary), ("hidden", self.hidden))
+            for name, digest in copy.contents().items()
         }
 
     @cached_property
-    def ran(self) -> Ran:
+    def run(self) -> OrdinaryRun:
         """The run that a user would make, on the scene as it is."""
         _ = self.before
         out, start = self.bench.folder("run") / "submission", time.monotonic()
-        ran = Ran("refused", "", 0.0, 0.0, out / "model")
+        run = OrdinaryRun("refused", "", 0.0, 0.0, out / "model")
         try:
             with self.bench.process("the run"):
                 submission = run_method(
@@ -134,17 +136,22 @@ class Trial:
         except DiskFullError:
             raise
         except SplashbenchError as error:
-            return replace(ran, reason=str(error))
+            return replace(run, reason=str(error))
         status, reason = submission.status.value, submission.reason
         if submission.status == Status.OK and (faults := check_submission(out, Scene.open(self.ordinary.scene))):
             status, reason = "faulty", faults[0]
         return replace(
-            ran,
+            run,
             status=status,
             reason=reason,
             fit_seconds=submission.record.fit_seconds or 0.0,
             seconds=time.monotonic() - start,
         )
+
+    def good_run(self) -> OrdinaryRun | None:
+        """The ordinary run, where there has been one that is ok; asking makes none."""
+        run: OrdinaryRun | None = self.__dict__.get("run")  # where cached_property keeps it
+        return run if run is not None and run.ok else None
 
     @cached_property
     def fitted(self) -> Answer:
@@ -166,7 +173,7 @@ class Trial:
     @cached_property
     def reloaded(self) -> Answer:
         """The model of the ordinary run, loaded in a fresh process on the scene as it is."""
-        return self._load(self.ordinary, self.ran.model)
+        return self._load(self.ordinary, self.run.model)
 
     @cached_property
     def refitted(self) -> Answer:
@@ -182,61 +189,42 @@ class Trial:
     def one_frame(self) -> Answer:
         """A fit of a small scene of one timestep."""
         scene = self._copy(self.small, "one_frame")
-        scenes.keep_first_frame(scene)
-        return self._fit(scenes.ordinary(scene, scene.parent), "one_frame")
+        scene_copies.keep_first_frame(scene)
+        return self._fit(scene_copies.ordinary(scene, scene.parent), "one_frame")
 
     @cached_property
     def no_liquid(self) -> Answer:
         """A fit of a small scene whose masks are all empty."""
         scene = self._copy(self.small, "no_liquid")
-        scenes.empty_masks(scene)
-        return self._fit(scenes.ordinary(scene, scene.parent), "no_liquid")
+        scene_copies.empty_masks(scene)
+        return self._fit(scene_copies.ordinary(scene, scene.parent), "no_liquid")
 
-    def known(self) -> Ran | None:
-        """The ordinary run, where there has been a good one; asking makes none."""
-        ran: Ran | None = self.__dict__.get("ran")  # where cached_property keeps it
-        return ran if ran is not None and ran.status == Status.OK.value else None
-
-    def stopped(self, how: signal.Signals | None, report: int) -> tuple[Stopped, Path]:
-        """A run held up at its progress report number `report` and stopped by the signal `how`, or by its time limit;
-        and the place of its submission."""
-        name = how.name if how else "timeout"
-        work = self.bench.folder(f"stopped_{name}")
-        out = self.bench.folder(f"stopped_{name}/out") / "submission"
-        arguments = [str(self.ordinary.scene), str(out), "--preset", self.preset, "--seed", str(SEED)]
-        arguments += ["--device", self.device, "--timing-frames", "0"]
-        for pair in as_pairs(self.overrides):
-            arguments += ["--set", pair]
-        limit = self.timeout_seconds
-        if how is None:
-            limit = round(STARTING_SECONDS + self.fitted.fit_seconds / 2, 1)
-            arguments += ["--timeout", f"{limit:g}"]
-        with self.bench.process(f"the run stopped by {name}"):
-            stopped = stop_run(
-                arguments,
-                method=self.name,
-                report=report,
-                work=work,
-                signum=how,
-                timeout_seconds=limit,
-                label=f"{self.method.id}: stopped by {name}",
-            )
-        return stopped, out
-
-    def _fit(self, place: scenes.Place, name: str, seed: int = SEED) -> Answer:
+    def _fit(self, scene: SceneCopy, name: str, seed: int = SEED) -> Answer:
         _ = self.before
-        return self.bench.child("fit", self._subject, seed, place, self.bench.folder(f"models/{name}"))
+        return self.bench.child("fit", self._subject, seed, scene, self.bench.folder(f"models/{name}"))
 
-    def _load(self, place: scenes.Place, model: Path) -> Answer:
+    def _load(self, scene: SceneCopy, model: Path) -> Answer:
         _ = self.before
-        return self.bench.child("load", self._subject, SEED, place, model)
+        return self.bench.child("load", self._subject, SEED, scene, model)
 
     def _copy(self, scene: Path, name: str) -> Path:
-        return scenes.copy_scene(scene, self.bench.folder(name))
+        return scene_copies.copy_scene(scene, self.bench.folder(name))
 
 
-@contextmanager
-def trial(name: str, **options: Any) -> Iterator[Trial]:
-    """A `Trial` in a temporary folder, which disappears afterwards."""
-    with tempfile.TemporaryDirectory(prefix="splashbench-conformance-") as work:
-        yield Trial(Path(work).resolve(), name, **options)
+def complete(answer: Answer, name: str) -> Answer:
+    """`answer`; raises NotTested where the process `name` ended on the way."""
+    if not answer.done:
+        raise NotTested(f"{name} ended in {answer.ended_in}: {answer.reason}")
+    return answer
+
+
+def complete_fit(evidence: Evidence) -> Answer:
+    """The fit without test views; raises NotTested where it failed."""
+    return complete(evidence.fitted, "the fit")
+
+
+def differences(one: Mapping[str, str], other: Mapping[str, str], than: str) -> list[str]:
+    """A line on what differs between two sets of digests, the second one called `than`; none where nothing does."""
+    names = [name for name, digest in one.items() if other.get(name) != digest]
+    more = f", as {len(names) - 1} more do" if names[1:] else ""
+    return [f"{names[0]} differs {than}{more}"] if names else []

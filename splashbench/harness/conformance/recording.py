@@ -1,8 +1,8 @@
-"""Which files a method touches, by Python's audit events; active in the child process that runs the method.
+"""Which files a method touches: by Python's audit events in its own process, by Linux's inotify in any.
 
-Seen are the calls of Python's own `open`, `os` and whatever is built on them, also in processes that are forked. Not
-seen: native code (cv2.imread), and other programs and interpreters that a method starts. `opening.py` sees those
-too, for the files of test views.
+Audit events show the calls of Python's own `open`, `os` and whatever is built on them, also in forked processes. They
+do not show native code (cv2.imread), nor other programs and interpreters that a method starts. inotify shows those
+too, for openings of the files that it watches.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,23 +31,24 @@ _CACHES = (
     "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "TORCH_HOME", "TORCH_EXTENSIONS_DIR", "TORCHINDUCTOR_CACHE_DIR",
     "MPLCONFIGDIR", "TRITON_CACHE_DIR", "CUDA_CACHE_PATH", "HF_HOME", "PYTHONPYCACHEPREFIX",
 )  # fmt: skip
-_MOST = 10_000
+_MAX_TOUCHES = 10_000
+How = Literal["read", "listed", "written"]
 
 
 class Touch(BaseModel):
     """A file or folder that was touched: one of the scene's that is no training view's, or one written elsewhere."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    how: Literal["read", "listed", "written"]
+    how: How
     path: str
 
 
-class Recorder:
+class TouchRecorder:
     """Appends to the file `log` what the method touches while `method()` is entered; one per process.
 
     Args:
-        scene: the scene whose training view the method was given, resolved.
-        allowed: files of the scene that the training view leads to, resolved.
+        scene: the scene whose training copy the method was given, resolved.
+        allowed: files of the scene that the training copy leads to, resolved.
         writable: folders that a method may write in, resolved.
     """
 
@@ -59,7 +60,7 @@ class Recorder:
         caches += [Path.home() / ".cache", Path.home() / ".nv", Path("/dev"), Path("/proc")]
         folders = [*writable, Path(tempfile.gettempdir()), *caches]
         self._writable = tuple(os.path.realpath(folder) for folder in folders)
-        self._known: set[tuple[str, str]] = set()
+        self._recorded: set[tuple[str, str]] = set()
         self._here = threading.local()
         self._active = False
         sys.addaudithook(self._hear)
@@ -85,23 +86,23 @@ class Recorder:
             for index in _CHANGES[event]:
                 self._record("written", arguments[index])
 
-    def _record(self, how: Literal["read", "listed", "written"], given: Any) -> None:
-        if not isinstance(given, (str, bytes, os.PathLike)) or len(self._known) >= _MOST:
+    def _record(self, how: How, name: Any) -> None:
+        if not isinstance(name, (str, bytes, os.PathLike)) or len(self._recorded) >= _MAX_TOUCHES:
             return  # a file descriptor: it was opened by name before
         self._here.busy = True
         try:
             # At once: a link may be gone later.
-            path = os.path.realpath(os.fsdecode(given))
-            if (how, path) in self._known or not self._matters(how, path):
+            path = os.path.realpath(os.fsdecode(name))
+            if (how, path) in self._recorded or not self._matters(how, path):
                 return
-            self._known.add((how, path))
+            self._recorded.add((how, path))
             os.write(self._log, json.dumps({"how": how, "path": path}).encode() + b"\n")
         except (OSError, ValueError, TypeError):
             return  # a name that no file can have; the call itself will fail
         finally:
             self._here.busy = False
 
-    def _matters(self, how: str, path: str) -> bool:
+    def _matters(self, how: How, path: str) -> bool:
         if _within(path, self._scene):
             return how == "written" or path not in self._allowed
         if how != "written" or "__pycache__" in path:
@@ -113,8 +114,56 @@ def _within(path: str, folder: str) -> bool:
     return path == folder or path.startswith(folder.rstrip("/") + "/")
 
 
-def read_touched(log: Path) -> list[Touch]:
-    """What a `Recorder` wrote; empty where it wrote nothing."""
+def read_touches(log: Path) -> list[Touch]:
+    """What a `TouchRecorder` wrote; empty where it wrote nothing."""
     if not log.is_file():
         return []
     return [Touch.model_validate_json(line) for line in log.read_text(encoding="utf-8").splitlines()]
+
+
+class OpeningWatch:
+    """Notices, from when it is entered, each opening of `files` and each listing of a folder of theirs.
+
+    Attributes:
+        opened: the paths opened or listed; filled in at the end.
+        complete: whether nothing can have been missed; False where the system has no inotify or too few watches.
+    """
+
+    def __init__(self, files: list[Path]) -> None:
+        self.opened: list[Path] = []
+        self.complete = False
+        self._files = set(files)
+        self._folders: dict[int, Path] = {}
+        self._inotify: Any = None
+
+    def __enter__(self) -> OpeningWatch:
+        if not self._files or not sys.platform.startswith("linux"):
+            return self
+        from inotify_simple import INotify, flags
+
+        with suppress(OSError):
+            self._inotify = INotify()
+            self.complete = True
+        for folder in sorted({path.parent for path in self._files}) if self._inotify else ():
+            try:
+                self._folders[self._inotify.add_watch(folder, flags.OPEN)] = folder
+            except OSError:
+                self.complete = False
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._inotify is None:
+            return
+        from inotify_simple import flags
+
+        opened: set[Path] = set()
+        for event in self._inotify.read(timeout=0):
+            if event.mask & flags.Q_OVERFLOW:
+                self.complete = False
+            elif event.wd in self._folders:
+                path = self._folders[event.wd] / event.name
+                if path in self._files or (event.mask & flags.ISDIR and not event.name):
+                    opened.add(path)
+        self._inotify.close()
+        self._inotify = None
+        self.opened = sorted(opened)
