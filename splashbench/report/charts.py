@@ -1,6 +1,6 @@
 """Speed against accuracy: fit time against LPIPS and against PSNR over background (docs/protocol.md, "Charts").
 
-PNG and SVG; the bytes depend on the results alone. What is drawn is worked out in speed_accuracy.py.
+PNG and SVG; the bytes depend on the results alone. speed_accuracy.py computes what is drawn.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _set_limits(axes: Axes, row: Machine, name: str, summaries: dict[str, Summar
     axes.minorticks_off()
     values = [dot.values[name] for entry in row.entries for dot in entry.dots if name in dot.values]
     values += [s.value_interval[i] for s in summaries.values() if s.value_interval for i in (0, 1)]
-    values += [known[name] for method, known in row.controls.items() if name in known and _on_scale(method, name)]
+    values += [figures[name] for method, figures in row.controls.items() if name in figures and _on_scale(method, name)]
     bottom, top = (min(values), max(values)) if values else (0.0, 1.0)
     margin = 0.14 * (top - bottom) or 0.1 * max(abs(top), 1e-3)
     axes.set_ylim(bottom - margin, top + margin)
@@ -158,13 +158,13 @@ def _on_scale(method: str, name: str) -> bool:
 
 
 def _draw_controls(axes: Axes, row: Machine, name: str) -> None:
-    for method, known in row.controls.items():
-        if name not in known or not _on_scale(method, name):
+    for method, figures in row.controls.items():
+        if name not in figures or not _on_scale(method, name):
             continue
-        axes.axhline(known[name], color=_GREY, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
+        axes.axhline(figures[name], color=_GREY, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
         axes.annotate(
             f"control: {method}",
-            (1.0, known[name]),
+            (1.0, figures[name]),
             xycoords=("axes fraction", "data"),
             xytext=(-3, 2),
             textcoords="offset points",
@@ -177,7 +177,7 @@ def _draw_controls(axes: Axes, row: Machine, name: str) -> None:
 
 
 def _draw_failures(axes: Axes, row: Machine, higher: bool) -> None:
-    """Failed runs stand at the bad end of the panel, by name: they have no value and must not vanish."""
+    """Write failed runs at the worse end of the panel, by name: they have no value and must not vanish."""
     for i, (what, count) in enumerate(sorted(row.failures.items())):
         height = 0.03 + 0.06 * i
         axes.text(
@@ -192,7 +192,7 @@ def _draw_failures(axes: Axes, row: Machine, higher: bool) -> None:
 
 
 def _filtered(rows: list[Machine]) -> set[str]:
-    """Labels of mixed methods of which a panel shows mIoU, which rests on the protocol's filter."""
+    """Labels of the mixed methods in panels that show mIoU, which rests on the protocol's filter."""
     shown = [row for row in rows if METRICS[row.perceptual_name()].filtered]
     return {entry.label for row in shown for entry in row.entries if entry.mixed}
 

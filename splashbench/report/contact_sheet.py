@@ -1,6 +1,6 @@
 """A contact sheet: ground truth, renders and foreground opacity of several submissions side by side.
 
-Figures hide haze outside the silhouette and liquid that is missing; a look does not.
+Metrics can hide haze outside the silhouette and missing liquid; the images show both.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def _spread_times(scene: Scene) -> list[int]:
 
 
 def _moment(scene: Scene, t: int) -> str:
-    known = "" if scene.times_source == "nominal" else f", {scene.times[t] - scene.times[0]:.2f} s"
-    return f"frame {t}{known}"
+    seconds = "" if scene.times_source == "nominal" else f", {scene.times[t] - scene.times[0]:.2f} s"
+    return f"frame {t}{seconds}"
 
 
 def _show(axes: Axes, image: NDArray, mask: NDArray[np.bool_] | None) -> None:

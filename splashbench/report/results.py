@@ -1,4 +1,4 @@
-"""Reading a folder of results, and what tells one entry of a table from another."""
+"""The results in a folder: every file read, repeats refused, order fixed."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ class ResultFile:
 def load_results(location: Path) -> list[ResultFile]:
     """Every result (*.json) below the folder `location`, or the one file, in one order on every machine.
 
-    A submission scored twice by the same protocol counts once: the result with more figures (one scored with a
-    reference, or with LPIPS weights) stands. Raises SplashbenchError for a file that is no result, and where there
-    is none.
+    A submission scored twice by the same protocol counts once: the result with more figures is used, such as the one
+    scored with LPIPS weights. Raises SplashbenchError for a file that is no result, and for a folder without any.
     """
     location = Path(location)
     if (location / "submission.toml").is_file():
@@ -50,7 +49,7 @@ def load_results(location: Path) -> list[ResultFile]:
 
 
 def _refuse_repeats(sources: list[ResultFile]) -> None:
-    """Two submissions of one method, settings, scene and seed are an old and a new run, not a spread over seeds."""
+    """Raise SplashbenchError for two submissions of one method, settings, scene and seed: an old and a new run."""
     seen: dict[tuple[str, ...], ResultFile] = {}
     for source in sources:
         result = source.result
@@ -65,7 +64,7 @@ def _refuse_repeats(sources: list[ResultFile]) -> None:
 
 
 def _plausible(path: Path, result: Result) -> Result:
-    """`result`, unless a figure is one that no score has and no chart can hold."""
+    """`result`. Raises SplashbenchError where a charted figure is out of range."""
     for name, least in _CHARTED.items():
         value = result.value(name)
         if value is not None and not least <= value <= _CHARTED_MAX:

@@ -1,4 +1,4 @@
-"""What the speed-accuracy chart shows, as numbers: dots, means with intervals, Pareto front, yardsticks, failures.
+"""What the speed-accuracy chart shows, as numbers: dots, means with intervals, Pareto front, controls, failures.
 
 docs/protocol.md, "Charts". One chart row per machine: a front that mixes hardware would compare machines, not methods.
 """
@@ -40,8 +40,8 @@ class ChartedMethod:
 
     def memory_bytes(self) -> float | None:
         """Median over the runs that measured it."""
-        known = [dot.memory_bytes for dot in self.dots if dot.memory_bytes is not None]
-        return float(np.median(known)) if known else None
+        measured = [dot.memory_bytes for dot in self.dots if dot.memory_bytes is not None]
+        return float(np.median(measured)) if measured else None
 
     def summary(self, name: str) -> Summary | None:
         """Inter-quartile mean of time and of metric `name` over the runs that have it."""
@@ -104,7 +104,7 @@ def summarize(pairs: NDArray[np.float64]) -> Summary:
 
 
 def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
-    """The points (seconds, value) that no other beats in both, fastest first."""
+    """The points (seconds, value) that no other point beats in both, fastest first."""
     sign = 1.0 if higher_is_better else -1.0
     front: list[tuple[float, float]] = []
     for seconds, value in sorted(points, key=lambda point: (point[0], -sign * point[1])):
@@ -114,9 +114,9 @@ def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) 
 
 
 def machines(sources: Sequence[ResultFile]) -> list[Machine]:
-    """The measured results by machine and protocol, in order of name; controls and failed runs set apart, none dropped.
+    """The measured results by machine and protocol, in order of name.
 
-    Figures of a changed protocol are other figures: they never share a panel with v1's.
+    Controls and failed runs are set apart; no run is dropped. Figures of two protocols never share a panel.
     """
     by_machine: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for source in sources:
@@ -147,9 +147,9 @@ def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
             entry.scenes.add(result.digests.scene)
     machine.entries = [entries[label] for label in sorted(entries)]
     for method, runs in sorted(controls.items()):
-        known = {name for run in runs for name in run}
+        metrics = {name for run in runs for name in run}
         machine.controls[method] = {
-            name: float(np.mean([run[name] for run in runs if name in run])) for name in sorted(known)
+            name: float(np.mean([run[name] for run in runs if name in run])) for name in sorted(metrics)
         }
     return machine
 

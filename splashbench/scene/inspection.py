@@ -1,4 +1,4 @@
-"""Looking a whole scene over: every fault at once, for `splashbench scene check`."""
+"""Inspection of a scene: all its faults for `splashbench scene check`, its facts for `splashbench scene info`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def check_scene(directory: Path) -> list[str]:
 
 
 def describe_scene(scene: Scene) -> dict:
-    """What `splashbench scene info` tells: sizes, split, times and what is known and unknown."""
+    """The facts of `splashbench scene info`: sizes, split, times, and None for what is unknown."""
     coverage = {
         camera: float(np.mean([scene.mask(camera, t).mean() for t in range(0, scene.n_frames, 5)]))
         for camera in scene.cameras

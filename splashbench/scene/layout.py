@@ -76,16 +76,16 @@ class SplitFile:
 
 def static_matrices(path: Path, key: str, values: list, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """The first frame's matrices [C, ...] of `values`, after checking shape, finiteness and that nothing moves."""
-    wanted = "x".join(map(str, shape))
+    expected = "x".join(map(str, shape))
     try:
         array = np.array(values, dtype=np.float64)
     except ValueError:
         raise SplashbenchError(
-            f"{path}: {key} is ragged; it must be {wanted} (frames, cameras, rows, columns)"
+            f"{path}: {key} is ragged; it must be {expected} (frames, cameras, rows, columns)"
         ) from None
     if array.shape != shape:
-        found = "x".join(map(str, array.shape))
-        raise SplashbenchError(f"{path}: {key} is {found}; it must be {wanted} (frames, cameras, rows, columns)")
+        actual = "x".join(map(str, array.shape))
+        raise SplashbenchError(f"{path}: {key} is {actual}; it must be {expected} (frames, cameras, rows, columns)")
     if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > LARGEST:
         raise SplashbenchError(
             f"{path}: {key} has entries that are not finite or beyond {LARGEST:g}; write the calibration again"

@@ -52,8 +52,8 @@ def is_neurofluid(directory: Path) -> bool:
 
 def _view_folders(directory: Path) -> list[str]:
     """Names of the folders view_1, view_2, ... in order of their numbers."""
-    found = [(int(match[1]), path.name) for path in directory.iterdir() if (match := _VIEW.fullmatch(path.name))]
-    return [name for _, name in sorted(found) if (directory / name).is_dir()]
+    folders = [(int(match[1]), path.name) for path in directory.iterdir() if (match := _VIEW.fullmatch(path.name))]
+    return [name for _, name in sorted(folders) if (directory / name).is_dir()]
 
 
 @dataclass
@@ -127,7 +127,7 @@ class NeuroFluidSource(SceneSource):
 
     def _described(self) -> SceneMeta:
         """What is known of these scenes; a scene.json in the folder goes before it, field by field."""
-        known = SceneMeta(
+        defaults = SceneMeta(
             name=plain_name(self.directory.resolve().name),
             times=[(number - self._numbers[0]) * STEP_SECONDS for number in self._numbers],
             sizes=self.train.sizes | self.test.sizes,
@@ -139,8 +139,8 @@ class NeuroFluidSource(SceneSource):
         changes = {field: getattr(stated, field) for field in stated.model_fields_set} if stated else {}
         if "times" not in changes:
             self.times_source = self.layout
-        changes["provenance"] = known.provenance | changes.get("provenance", {})
-        return known.model_copy(update=changes)
+        changes["provenance"] = defaults.provenance | changes.get("provenance", {})
+        return defaults.model_copy(update=changes)
 
     def image_path(self, camera: str, t: int) -> Path:
         return self.directory / self._paths[camera][t]
@@ -231,10 +231,10 @@ class NeuroFluidSource(SceneSource):
             return []
         steps = np.diff(self.meta.times)
         moved = np.diff(true.positions.astype(np.float64), axis=0)
-        told = (true.velocities[1:] + true.velocities[:-1]).astype(np.float64) / 2 * steps[:, None, None]
-        if np.square(told).sum(axis=-1).mean() < (PARTICLE_RADIUS / 10) ** 2:
+        expected = (true.velocities[1:] + true.velocities[:-1]).astype(np.float64) / 2 * steps[:, None, None]
+        if np.square(expected).sum(axis=-1).mean() < (PARTICLE_RADIUS / 10) ** 2:
             return []  # at rest, which tells nothing
-        share = float((moved * told).sum() / np.square(told).sum())
+        share = float((moved * expected).sum() / np.square(expected).sum())
         if abs(share - 1) <= _MOTION_TOLERANCE:
             return []
         return [

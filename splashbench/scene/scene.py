@@ -33,7 +33,7 @@ class Scene:
     """A scene on disk. Use `Scene.open`.
 
     Attributes:
-        directory, name: where it lies and what it is called. layout: "released" or "neurofluid", that of its files.
+        directory, name: folder and name. layout: "released" or "neurofluid", that of its files.
         cameras: name -> Camera, training cameras first.
         train, test: camera names of the split.
         frames: file stems of the timesteps, such as "000000".
@@ -95,16 +95,18 @@ class Scene:
         else:
             self.times = np.arange(self.n_frames, dtype=np.float64) * NOMINAL_STEP_SECONDS
             self.times_source = "nominal"
-        own = (self.meta.camera_times if self.meta else None) or {}
-        for key, known in (("camera_times", own), ("sizes", (self.meta.sizes if self.meta else None) or {})):
-            unknown = sorted(set(known) - set(self.cameras))
+        camera_times = (self.meta.camera_times if self.meta else None) or {}
+        for key, entries in (("camera_times", camera_times), ("sizes", (self.meta.sizes if self.meta else None) or {})):
+            unknown = sorted(set(entries) - set(self.cameras))
             if unknown:
                 raise SplashbenchError(
                     f"{self.directory / 'scene.json'}: {key} names camera {unknown[0]}, which the scene does not have; "
                     "fix the entry"
                 )
         self.camera_times = {
-            name: self._checked_times(f"camera_times of {name}", own[name]) if name in own else self.times
+            name: self._checked_times(f"camera_times of {name}", camera_times[name])
+            if name in camera_times
+            else self.times
             for name in self.cameras
         }
 
@@ -183,7 +185,7 @@ class Scene:
         return self._source.truth_digest()
 
     def faults(self) -> list[str]:
-        """What contradicts itself in files that are whole one by one, a line each."""
+        """Contradictions between files that are valid one by one, a line each."""
         return self._source.faults()
 
     @cached_property

@@ -37,7 +37,7 @@ class SceneSource(ABC):
     """The files of one scene, its calibration read and checked; both splits cover the same timesteps.
 
     Attributes:
-        directory, name: where it lies and what it is called.
+        directory, name: folder and name.
         meta: what is known beyond the calibration, or None.
         train, test: the split.
         times_source: where `meta.times` come from, where they are known.

@@ -71,9 +71,9 @@ def _numbered(views: Mapping[str, Transforms]) -> dict[str, dict[int, Transforms
     names: tuple[Callable[[TransformsFrame], str | None], ...] = (lambda f: f.particle_path, lambda f: f.file_path)
     for name_of in names:
         numbered = {view: _by_number(transforms.frames, name_of) for view, transforms in views.items()}
-        known = {view: frames for view, frames in numbered.items() if frames is not None}
-        if len(known) == len(views):
-            return known
+        complete = {view: frames for view, frames in numbered.items() if frames is not None}
+        if len(complete) == len(views):
+            return complete
     return {view: dict(enumerate(transforms.frames)) for view, transforms in views.items()}
 
 
@@ -81,8 +81,8 @@ def _by_number(
     frames: Sequence[TransformsFrame], name_of: Callable[[TransformsFrame], str | None]
 ) -> dict[int, TransformsFrame] | None:
     """The frames by the number at the end of their name; None where one has none or two have the same."""
-    found = [_NUMBER.search(name_of(frame) or "") for frame in frames]
-    numbered = {int(match[1]): frame for match, frame in zip(found, frames) if match}
+    matches = [_NUMBER.search(name_of(frame) or "") for frame in frames]
+    numbered = {int(match[1]): frame for match, frame in zip(matches, frames) if match}
     return numbered if len(numbered) == len(frames) else None
 
 

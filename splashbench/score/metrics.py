@@ -38,7 +38,7 @@ class Metric:
 
     @property
     def filtered(self) -> bool:
-        """Whether, of a mixed method, the figure is of those primitives alone that the silhouettes allow to be liquid.
+        """Whether a mixed method's figure covers only those primitives that the silhouettes allow to be liquid.
 
         The filter is no part of the method (observe/consistency.py), so tables and charts mark such figures.
         """

@@ -1,6 +1,6 @@
 """The liquid's share of a mixed method's primitives (paper, supplement, "Evaluation Protocol").
 
-Baselines hold background and liquid in one set; their liquid is what observe/consistency.py lets through.
+Baselines hold background and liquid in one set. Their liquid is the part that observe/consistency.py accepts.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from splashbench.scene import Particles, Scene
 
 
 def liquid_of_mixed(particles: Particles, scene: Scene) -> Particles:
-    """`particles` with those inactive that lie outside the silhouette of any training view."""
+    """`particles`, of which those outside the silhouette of any training view are inactive."""
     active = particles.active.copy()
     for t in range(particles.n_frames):
         shown = np.flatnonzero(active[t])

@@ -1,7 +1,7 @@
 """Scoring: Submission -> Result by one fixed protocol (paper, "Metrics"; every choice: docs/protocol.md).
 
-The scene is the only ground truth, test views the only images looked at, training masks the only geometry; true
-particles, where a synthetic scene has them, give metrics of their own.
+Ground truth comes from the scene alone: images of test views, geometry from training masks. The true particles of a
+synthetic scene give metrics of their own.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ def score_submission(
     """Score one verified submission (`splashbench.submission.Submission`) of `scene`.
 
     Args:
-        reference: the submission of the control `nothing` on this scene; without it what needs it is null.
+        reference: the submission of the control `nothing` on this scene; metrics that need it are null without it.
         lpips_weights: an .npz of LPIPS weights, see `splashbench.score.image.lpips.load_lpips`.
         track: wraps an iterable with a description, to show progress.
         protocol: other settings than v1's make a result that no table mixes with v1.
         fields: signed distance from the training masks when several submissions share it, see `shared_fields`.
 
-    Raises SplashbenchError when the submission or the reference is of another scene, or not as it was checked.
+    Raises SplashbenchError when the submission or the reference is of another scene, or has changed since its check.
     A submission that is not "ok" gives a result with that status and reason, and no score.
     """
     identity = submission.identity
@@ -152,16 +152,16 @@ def require_complete(scene: Scene, submission: Any) -> None:
 
 
 def _costs(record: Any) -> dict[str, MetricValue]:
-    """What the harness measured; the method has no say in it. A frame rate from few frames is none."""
+    """What the harness measured, never what the method claims. A frame rate needs MIN_TIMED_FRAMES frames."""
     costs = {
         name: metric_value(name, _number(getattr(record, name)), "not measured")
         for name, metric in METRICS.items()
         if metric.group == "cost"
     }
-    timed = getattr(record, "timed_frames", None)
-    if timed is not None and timed < MIN_TIMED_FRAMES:
-        few = f"only {timed} frames were timed, not {MIN_TIMED_FRAMES}"
-        costs["render_fps"] = metric_value("render_fps", None, few)
+    n_timed = getattr(record, "timed_frames", None)
+    if n_timed is not None and n_timed < MIN_TIMED_FRAMES:
+        reason = f"only {n_timed} frames were timed, not {MIN_TIMED_FRAMES}"
+        costs["render_fps"] = metric_value("render_fps", None, reason)
     return costs
 
 

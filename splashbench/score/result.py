@@ -1,7 +1,7 @@
 """A result: one immutable JSON per method, scene, preset and seed, with every value behind every mean.
 
-A figure that could not be had is null and says why; a run that failed is a result with a status, a reason and nulls,
-and never a score. Results name by digest what they were computed from.
+A figure that cannot be computed is null, with a reason. A failed run is a result with a status, a reason and nulls,
+never with a score. Results name by digest what they were computed from.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class MetricValue(_Frozen):
 
 
 class Digests(_Frozen):
-    """SHA-256 of everything a result depends on; null is not used. truth: of the scene's true particles."""
+    """SHA-256 of everything a result depends on; null for what was not used. truth: of the scene's true particles."""
 
     scene: str
     submission: str

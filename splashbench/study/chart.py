@@ -1,4 +1,4 @@
-"""A study's chart: every row's figure with bars over seeds, and the paper's in panels of their own, hollow.
+"""A study's chart: a mark per row with bars over seeds; the paper's figures hollow, in panels of their own.
 
 PNG and SVG; the bytes depend on the results alone.
 """
@@ -85,8 +85,8 @@ def _panel(axes: Axes, table: Table, name: str, reported: bool, named: bool) -> 
         colour = _VERMILION if row.name == table.plan.spec.baseline else _GREY if row.control else _BLUE
         value = values[row.name]
         if value is None:
-            said = "not reported" if reported else _why(row)
-            _write_at_edge(axes, said, y)
+            reason = "not reported" if reported else _why(row)
+            _write_at_edge(axes, reason, y)
             continue
         if row.control and not low <= value <= high:
             _write_at_edge(axes, f"{value:.3g} →" if value > high else f"← {value:.3g}", y, right=value > high)
@@ -109,16 +109,16 @@ def _panel(axes: Axes, table: Table, name: str, reported: bool, named: bool) -> 
 
 
 def _limits(rows: list[TableRow], name: str, reported: bool) -> tuple[float, float]:
-    """Between which a control is drawn to scale: it may widen the axis to three times what the rows take up."""
-    known = [value for row in rows if (value := _value(row, name, reported)) is not None]
-    if not known:
+    """The range in which controls are drawn to scale: three times the range of the other rows."""
+    values = [value for row in rows if (value := _value(row, name, reported)) is not None]
+    if not values:
         return -inf, inf
-    reach = (max(known) - min(known)) or abs(known[0]) or 1.0
-    return min(known) - reach, max(known) + reach
+    reach = (max(values) - min(values)) or abs(values[0]) or 1.0
+    return min(values) - reach, max(values) + reach
 
 
 def _write_at_edge(axes: Axes, text: str, y: int, right: bool = False) -> None:
-    """In place of a mark: why there is none, or the value of a control beyond the panel's edge."""
+    """Write why a mark is missing, or the value of a control beyond the panel's edge."""
     axes.annotate(
         text,
         (0.99 if right else 0.01, y),
@@ -132,7 +132,7 @@ def _write_at_edge(axes: Axes, text: str, y: int, right: bool = False) -> None:
 
 
 def _name(row: TableRow, reported: bool) -> str:
-    """The row's name, and how many of its runs came through where some did not: no failure may vanish from a chart."""
+    """The row's name; with the number of runs that succeeded where some failed, so that no failure vanishes."""
     return row.name if reported or row.complete else f"{row.name} ({row.count('ok')} of {len(row.runs)} runs)"
 
 

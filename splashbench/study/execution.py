@@ -1,6 +1,6 @@
-"""Carrying out a plan: what is there is kept, the rest is run, one after another or several at once.
+"""The execution of a plan: runs that exist are reused, the others are made, one after another or several at once.
 
-Killed at any time, a study loses the runs in progress. A run that fails is an entry like any other.
+A study that is killed loses only the runs in progress. A run that fails has an entry like any other.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ExecutionOptions:
 
 @dataclass
 class Tally:
-    """How many runs were made now, and how many were there."""
+    """How many runs were made now, and how many existed before."""
 
     made: int = 0
     kept: int = 0
@@ -60,15 +60,15 @@ class Tally:
 def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tally:
     """Make every run of `plan` that is not in the folder `out` yet.
 
-    Raises SplashbenchError where `out` is another's, or another process is at it, or the disk is full.
+    Raises SplashbenchError where `out` holds other files, where another study runs in it, and for a full disk.
     """
     store = Store(out)
     with _claimed(store):
-        chosen = [run for run in plan.runs if options.only is None or run.variant.name in options.only]
+        selected = [run for run in plan.runs if options.only is None or run.variant.name in options.only]
         with_lpips = "lpips" in plan.spec.metrics and load_lpips(options.lpips_weights)[0] is not None
-        missing = {run.digest: run for run in chosen if _is_missing(run, store, with_lpips, options.retry)}
+        missing = {run.digest: run for run in selected if _is_missing(run, store, with_lpips, options.retry)}
         needed = {run.reference for run in missing.values()}
-        in_table = {run.digest for run in plan.reference_row} & {run.reference for run in chosen}
+        in_table = {run.digest for run in plan.reference_row} & {run.reference for run in selected}
         references = [
             run
             for run in plan.references
@@ -80,11 +80,11 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
         # First what others are measured against; it also fits the backgrounds that they share.
         for runs, is_reference in ((references, True), (missing.values(), False)):
             _run_all([_job(plan, run, out, options, is_reference) for run in runs], options.jobs, progress)
-        return Tally(total, len({run.digest for run in chosen}) - len(missing))
+        return Tally(total, len({run.digest for run in selected}) - len(missing))
 
 
 def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) -> bool:
-    """Whether the run is to be made: it is not there, or it lacks a figure that can be had by now."""
+    """Whether the run is to be made: it does not exist, or it lacks a figure that can be computed now."""
     entry = store.entry(run.digest)
     if entry is None or entry.status == ERROR:
         return True
@@ -121,13 +121,13 @@ def _job(plan: StudyPlan, run: PlannedRun, out: Path, options: ExecutionOptions,
 
 
 def _seconds_before(plan: StudyPlan, store: Store) -> list[float]:
-    """What the runs that are there took."""
+    """Seconds that each existing run took."""
     entries = [store.entry(run.digest) for run in plan.runs]
     return [entry.seconds for entry in entries if entry is not None and entry.status != ERROR]
 
 
 class _Progress:
-    """Says before each run which it is and about how long the rest takes."""
+    """Tells the user before each run which one it is and about how long the rest takes."""
 
     def __init__(self, total: int, options: ExecutionOptions, seconds: list[float]) -> None:
         self._total, self._jobs, self._tell = total, options.jobs, options.tell
@@ -135,11 +135,11 @@ class _Progress:
 
     def starts(self, job: Job) -> None:
         self._started += 1
-        left = ""
+        remaining = ""
         if self._seconds:
             mean = sum(self._seconds) / len(self._seconds)
-            left = f", about {duration(mean * (self._total - self._ended) / self._jobs)} left"
-        self._tell(f"run {self._started} of {self._total}{left}: {job.title}")
+            remaining = f", about {duration(mean * (self._total - self._ended) / self._jobs)} left"
+        self._tell(f"run {self._started} of {self._total}{remaining}: {job.title}")
 
     def ends(self, entry: RunEntry) -> None:
         self._ended += 1
@@ -198,7 +198,7 @@ class _Worker:
         return self._process.poll() is not None
 
     def entry(self) -> RunEntry:
-        """What the process wrote, or that it ended without."""
+        """The entry that the process wrote; an error entry where it ended without one."""
         if self._process.returncode == 0:
             entry = self._store.entry(self._job.digest)
             if entry is not None:

@@ -1,6 +1,6 @@
-"""One run of a study: made, scored and written down, in this process or a child.
+"""One run of a study: fit, score, entry; in this process or a child.
 
-What it leaves is a result in results/ and an entry in runs/, written last: a run with an entry is whole.
+It leaves a result in results/ and an entry in runs/. The entry is written last: a run with an entry is complete.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ERROR = "error"
 
 
 class Job(BaseModel):
-    """What a process is told: a planned run with all its paths."""
+    """What the process of a run is given: the planned run with all its paths."""
 
     model_config = ConfigDict(extra="forbid")
     digest: str
@@ -50,9 +50,12 @@ class Job(BaseModel):
 
 
 class RunEntry(BaseModel):
-    """runs/DIGEST.json: a run that is done. `result` is its file in results/, null where there is none to score.
+    """runs/DIGEST.json: a run that has ended.
 
-    at_once: how many runs shared the machine. seconds: all that the run took here, scoring included.
+    Attributes:
+        result: name of its file in results/; null where there is none.
+        at_once: how many runs shared the machine.
+        seconds: duration of the run, scoring included.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -69,7 +72,7 @@ class RunEntry(BaseModel):
 
 
 class Store:
-    """The folder of a study: where its runs lie, and what is scratch."""
+    """The folder of a study: its results, entries, submissions and cache."""
 
     def __init__(self, out: Path) -> None:
         self.out = Path(out)
@@ -77,7 +80,7 @@ class Store:
         self.cache = self.out / "cache"
 
     def entry(self, digest: str) -> RunEntry | None:
-        """The entry of the run `digest` and None where there is none that is whole."""
+        """The entry of the run `digest`, None where there is none or its result is missing."""
         path = self.entry_path(digest)
         if not path.is_file():
             return None
@@ -105,26 +108,26 @@ class Store:
 
 
 def carry_out(job: Job) -> RunEntry:
-    """Make the run, score it, and write both down. What goes wrong is an entry with a status and a reason.
+    """Make the run, score it, and write its entry. A run that fails has an entry with a status and a reason.
 
-    Raises DiskFullError alone: then no other run would come through either.
+    Raises DiskFullError only, since no other run would succeed either.
     """
     store, start = Store(Path(job.out)), time.monotonic()
-    done = RunEntry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once)
+    entry = RunEntry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once)
     try:
-        done = _scored(job, store, done)
+        entry = _scored(job, store, entry)
     except DiskFullError:
         raise
     except SplashbenchError as error:
-        done = done.model_copy(update={"reason": str(error)})
+        entry = entry.model_copy(update={"reason": str(error)})
     except Exception as error:  # a run of many: the others go on
-        done = done.model_copy(update={"reason": one_line(f"{type(error).__name__}: {error}")})
-    before = store.entry(job.digest)
-    done = done.model_copy(update={"seconds": time.monotonic() - start})
-    write_model(store.entry_path(job.digest), done)
-    if before and before.result and before.result != done.result:
-        (store.results / before.result).unlink(missing_ok=True)
-    return done
+        entry = entry.model_copy(update={"reason": one_line(f"{type(error).__name__}: {error}")})
+    earlier = store.entry(job.digest)
+    entry = entry.model_copy(update={"seconds": time.monotonic() - start})
+    write_model(store.entry_path(job.digest), entry)
+    if earlier and earlier.result and earlier.result != entry.result:
+        (store.results / earlier.result).unlink(missing_ok=True)
+    return entry
 
 
 def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
@@ -151,7 +154,7 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     else:
         reference = store.reference(job.reference) if job.reference else None
     weights = Path(job.lpips_weights) if job.lpips_weights else None
-    # The ruler is the scene as it is: worse masks or fewer views must not move what runs are measured by.
+    # Evaluation data never change: the fields come from the scene itself, not from worse masks or fewer views.
     result = score_submission(scene, submission, reference, weights, fields=shared_fields(original))
     saved = result.save(store.results)
     if not job.keep and not job.is_reference:

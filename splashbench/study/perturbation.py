@@ -60,9 +60,9 @@ def empty_masks(share: float) -> Draw:
     """Keeps nothing of `share` of the masks with liquid, rounded to whole masks, and all of the others."""
 
     def draw(wet: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float64]:
-        kept = np.ones(wet.shape)
-        kept[wet] = np.where(_hardness_ranks(wet, rng) < round(share * wet.sum()), 0.0, 1.0)
-        return kept
+        shares = np.ones(wet.shape)
+        shares[wet] = np.where(_hardness_ranks(wet, rng) < round(share * wet.sum()), 0.0, 1.0)
+        return shares
 
     return draw
 
@@ -89,10 +89,10 @@ def missing_parts(target_iou: float) -> Draw:
         )
 
     def draw(wet: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float64]:
-        kept = np.ones(wet.shape)
+        shares = np.ones(wet.shape)
         quantiles = (_hardness_ranks(wet, rng) + 0.5) / max(1, wet.sum())
-        kept[wet] = share_kept(quantiles) if target_iou < 1 else 1.0
-        return kept
+        shares[wet] = share_kept(quantiles) if target_iou < 1 else 1.0
+        return shares
 
     return draw
 
@@ -113,11 +113,11 @@ def direction_of_loss(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.array([np.sin(angle), np.cos(angle)])
 
 
-def without_part(mask: NDArray[np.bool_], kept: float, direction: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """`mask` [H, W] with the share `kept` of its pixels, those least far in `direction` (x, y; y down)."""
+def without_part(mask: NDArray[np.bool_], share: float, direction: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """`mask` [H, W] with `share` of its pixels, those least far in `direction` (x, y; y down)."""
     rows, columns = np.nonzero(mask)
-    count = round(kept * len(rows))
+    count = round(share * len(rows))
     nearest = np.argsort(columns * direction[0] + rows * direction[1], kind="stable")[:count]
-    left = np.zeros_like(mask)
-    left[rows[nearest], columns[nearest]] = True
-    return left
+    result = np.zeros_like(mask)
+    result[rows[nearest], columns[nearest]] = True
+    return result

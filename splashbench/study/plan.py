@@ -1,7 +1,7 @@
 """From a spec to the runs it asks for, each with a digest of all it depends on.
 
-A run is told by that digest and not by its row: rows that come to the same thing share a run, and a run that was made
-under another spec counts here too.
+The digest identifies a run, its row does not. Rows with the same settings share a run, and a run that was made under
+another spec is used here too.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class StudyPlan:
 
 
 def make_plan(spec: StudySpec) -> StudyPlan:
-    """The runs of `spec`, seed by seed. Everything that can be wrong before a run starts is found here.
+    """The runs of `spec`, seed by seed. All that can be wrong before a run starts is reported here.
 
     Raises SplashbenchError, one line, for a missing scene, an unknown method, preset or setting.
     """
@@ -104,13 +104,13 @@ def make_plan(spec: StudySpec) -> StudyPlan:
                         row.method.control,
                     )
                 )
-    own = load_method(spec.method)
-    preset = spec.preset or next(iter(own.Config.presets))
-    return StudyPlan(spec, own, preset, scenes, tuple(references.values()), tuple(runs))
+    method = load_method(spec.method)
+    preset = spec.preset or next(iter(method.Config.presets))
+    return StudyPlan(spec, method, preset, scenes, tuple(references.values()), tuple(runs))
 
 
 class _MethodChoice(NamedTuple):
-    """What a variant runs: a method under the name it was given, its preset, what is set on it, and all settings."""
+    """What a variant runs: its method, the method's name in the spec, preset, overrides and resolved settings."""
 
     method: Method
     name: str
@@ -123,11 +123,11 @@ def _row(spec: StudySpec, variant: StudyVariant) -> _MethodChoice:
     name = variant.method or spec.method
     method = load_method(name)
     if spec.device not in method.devices:
-        known = ", ".join(method.devices)
-        raise SplashbenchError(f"study {spec.name}: method {method.id} runs on {known}, not on {spec.device!r}")
-    own = variant.method is None
-    preset = variant.preset or (spec.preset if own else None) or next(iter(method.Config.presets))
-    overrides, resolved = _checked(spec, method, variant.name, preset, variant.settings, with_base=own)
+        devices = ", ".join(method.devices)
+        raise SplashbenchError(f"study {spec.name}: method {method.id} runs on {devices}, not on {spec.device!r}")
+    of_study_method = variant.method is None
+    preset = variant.preset or (spec.preset if of_study_method else None) or next(iter(method.Config.presets))
+    overrides, resolved = _checked(spec, method, variant.name, preset, variant.settings, with_base=of_study_method)
     return _MethodChoice(method, name, preset, overrides, resolved)
 
 
@@ -145,7 +145,7 @@ def _open_scenes(spec: StudySpec) -> tuple[NamedScene, ...]:
 def _checked(
     spec: StudySpec, method: Method, row: str, preset: str, settings: Mapping[str, Any], *, with_base: bool = True
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The overrides of a row, and all its settings; an unknown one is told by row."""
+    """The overrides of a row, and all its settings. Raises SplashbenchError for an unknown setting."""
     overrides = {**(spec.base if with_base else {}), **settings}
     try:
         config = method.Config.preset(preset, overrides)
@@ -157,18 +157,18 @@ def _checked(
 def _reference(spec: StudySpec, scene: NamedScene, variant: StudyVariant, seed: int, timing: int) -> PlannedRun | None:
     if spec.reference is None:
         return None
-    wanted = spec.reference
-    method = load_method(wanted.method)
-    preset = wanted.preset or next(iter(method.Config.presets))
-    overrides, resolved = _checked(spec, method, wanted.method, preset, wanted.settings, with_base=False)
+    reference = spec.reference
+    method = load_method(reference.method)
+    preset = reference.preset or next(iter(method.Config.presets))
+    overrides, resolved = _checked(spec, method, reference.method, preset, reference.settings, with_base=False)
     changed = changes(scene.scene, variant, seed) is not None
     row = StudyVariant(
-        name=wanted.method,
+        name=reference.method,
         perturbation=variant.perturbation if changed else (),
         train_views=variant.train_views if changed else None,
     )
     digest = _digest(method, preset, resolved, seed, "cpu", scene.scene, row)
-    return PlannedRun(scene, row, seed, digest, wanted.method, preset, overrides, None, timing, method.control)
+    return PlannedRun(scene, row, seed, digest, reference.method, preset, overrides, None, timing, method.control)
 
 
 def _digest(
@@ -180,7 +180,7 @@ def _digest(
     scene: Scene,
     variant: StudyVariant,
 ) -> str:
-    said = {
+    parts = {
         "method": [method.id, method.version],
         "preset": preset,
         "settings": settings,
@@ -189,6 +189,6 @@ def _digest(
         "scene": [scene.digest, changes(scene, variant, seed)],
         "protocol": PROTOCOL_V1.digest,
     }
-    if variant.withheld:  # said only where it is so: the digests of other runs stay
-        said["withheld"] = variant.withheld
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    if variant.withheld:  # only where timesteps are withheld: digests of earlier runs must not change
+        parts["withheld"] = variant.withheld
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -21,8 +21,8 @@ def write_report(table: Table, out: Path, command: str) -> list[Path]:
         write_text(staging / "runs.csv", runs_csv(table))
         write_json(staging / "table.json", as_json(table, command))
         write_text(staging / "table.md", to_markdown(table, command))
-        made = ["table.md", "table.csv", "runs.csv", "table.json", *(path.name for path in draw_chart(table, staging))]
-    return [Path(out, name) for name in made]
+        names = ["table.md", "table.csv", "runs.csv", "table.json", *(path.name for path in draw_chart(table, staging))]
+    return [Path(out, name) for name in names]
 
 
 def table_csv(table: Table) -> str:

@@ -1,7 +1,6 @@
-"""The scene a run is made on: the scene itself, or a copy with worse training masks or fewer training views.
+"""The scene of a run: the scene itself, or a copy with worse training masks or fewer training views.
 
-A copy shares every file with its scene that does not differ (hard links where the disk allows them); test views are
-always the scene's own.
+A copy shares all unchanged files with its scene, by hard links where the disk allows them. Test views never change.
 """
 
 from __future__ import annotations
@@ -31,19 +30,19 @@ _VERSION = 1
 
 
 def changes(scene: Scene, variant: StudyVariant, seed: int) -> dict[str, Any] | None:
-    """How the scene of `variant`'s run differs from `scene`, in JSON's terms; None where it does not.
+    """How the scene of a run of `variant` differs from `scene`, as JSON; None where it does not.
 
     Raises SplashbenchError where the scene cannot be changed so.
     """
-    said: dict[str, Any] = {}
+    changed: dict[str, Any] = {}
     if variant.train_views is not None:
         views = variant.train_views
-        kept = nested_views(scene, views) if isinstance(views, int) else _named_views(scene, views)
-        if kept != scene.train:
-            said["train_views"] = list(kept)
+        train = nested_views(scene, views) if isinstance(views, int) else _named_views(scene, views)
+        if train != scene.train:
+            changed["train_views"] = list(train)
     if variant.perturbation:
-        said |= {"masks": [step.model_dump() for step in variant.perturbation], "seed": seed}
-    return said | {"version": _VERSION} if said else None
+        changed |= {"masks": [step.model_dump() for step in variant.perturbation], "seed": seed}
+    return changed | {"version": _VERSION} if changed else None
 
 
 def _named_views(scene: Scene, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -56,18 +55,18 @@ def _named_views(scene: Scene, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -> Scene:
-    """`scene` as `variant` has it: itself, or its copy in the folder `cache`, made there where it is not yet."""
-    said = changes(scene, variant, seed)
-    if said is None:
+    """`scene`, or the copy of it that `variant` asks for, made in the folder `cache` where it does not exist yet."""
+    changed = changes(scene, variant, seed)
+    if changed is None:
         return scene
-    text = json.dumps([scene.digest, said], sort_keys=True)
+    text = json.dumps([scene.digest, changed], sort_keys=True)
     # The folder keeps its name: without scene.json it decides what a scene is (Table S1).
     place = cache / hashlib.sha256(text.encode()).hexdigest()[:16] / scene.directory.resolve().name
     place.parent.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(place.parent.with_suffix(".lock")):
         if not place.exists():
             with atomic_directory(place) as staging:
-                _copy(scene, said.get("train_views", list(scene.train)), staging)
+                _copy(scene, changed.get("train_views", list(scene.train)), staging)
                 if variant.perturbation:
                     _perturb_masks(Scene.open(staging), scene, variant.perturbation, seed)
     return Scene.open(place)
@@ -75,49 +74,49 @@ def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -
 
 def _copy(scene: Scene, train: list[str], directory: Path) -> None:
     """A copy of `scene` with the training views `train` only, in the released layout."""
-    kept = [*train, *scene.test]
+    cameras = [*train, *scene.test]
     if scene.layout != ReleasedSource.layout:
-        _convert(scene, train, kept, directory)
+        _convert(scene, train, cameras, directory)
         return
-    gone = set(scene.cameras) - set(kept)
+    left_out = set(scene.cameras) - set(cameras)
     for root, folders, names in os.walk(scene.directory):
         folders.sort()
         for name in names:
             path = Path(root, name).relative_to(scene.directory)
-            if path.parts[0] in ("ims", "seg", "container_mask") and Path(path.parts[1]).stem in gone:
+            if path.parts[0] in ("ims", "seg", "container_mask") and Path(path.parts[1]).stem in left_out:
                 continue
             _link(scene.directory / path, directory / path)
     columns = [scene.train.index(name) for name in train]
     meta = read_json(scene.directory / "train_meta.json")
     for key in ("k", "w2c", "fn"):
         meta[key] = [[row[column] for column in columns] for row in meta[key]]
-    # Written as new files: the links go, and with them the way back to the scene's own.
+    # Written as new files: writing through a link would change the original scene.
     write_json(directory / "train_meta.json", meta)
     if scene.meta is not None:
-        write_model(directory / "scene.json", _meta_of(scene.meta, kept))
+        write_model(directory / "scene.json", _meta_of(scene.meta, cameras))
 
 
-def _meta_of(meta: SceneMeta, kept: list[str]) -> SceneMeta:
-    """`meta` with the entries of the cameras `kept` alone."""
+def _meta_of(meta: SceneMeta, names: list[str]) -> SceneMeta:
+    """`meta` with the entries of the cameras `names` alone."""
     subsets = {
-        key: {name: value for name, value in known.items() if name in kept}
+        key: {name: value for name, value in entries.items() if name in names}
         for key in ("sizes", "camera_times")
-        if (known := getattr(meta, key)) is not None
+        if (entries := getattr(meta, key)) is not None
     }
     return meta.model_copy(update=subsets)
 
 
-def _convert(scene: Scene, train: list[str], kept: list[str], directory: Path) -> None:
+def _convert(scene: Scene, train: list[str], names: list[str], directory: Path) -> None:
     """Write what `_copy` links, of a scene in another layout."""
-    pairs = ((name, t) for name in kept for t in range(scene.n_frames))
+    pairs = ((name, t) for name in names for t in range(scene.n_frames))
     write_scene(
         directory,
-        cameras={name: scene.cameras[name] for name in kept},
+        cameras={name: scene.cameras[name] for name in names},
         train=train,
         test=scene.test,
         n_frames=scene.n_frames,
         frames=((name, t, scene.image(name, t), scene.mask(name, t)) for name, t in pairs),
-        meta=_meta_of(scene.meta or SceneMeta(name=plain_name(scene.name)), kept),
+        meta=_meta_of(scene.meta or SceneMeta(name=plain_name(scene.name)), names),
         initial_points=scene.initial_points(),
     )
     if scene.meta is not None and scene.meta.container_mesh is not None:
@@ -139,12 +138,12 @@ def _perturb_masks(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], s
     """Replace the training masks of `copy` by worse ones; the same seed gives the same masks."""
     wet = np.array([[scene.mask(name, t).any() for t in range(scene.n_frames)] for name in copy.train])
     rng = np.random.default_rng([seed, *hashlib.sha256(scene.name.encode()).digest()[:8]])
-    kept = np.ones(wet.shape)
+    shares = np.ones(wet.shape)
     for step in steps:
-        kept *= step.draw()(wet, rng)
+        shares *= step.draw()(wet, rng)
     for c, name in enumerate(copy.train):
         direction = direction_of_loss(rng)
         for t in range(scene.n_frames):
-            if kept[c, t] < 1:
-                left = without_part(scene.mask(name, t), kept[c, t], direction)
-                write_png(copy.mask_path(name, t), np.where(left, 255, 0).astype(np.uint8))
+            if shares[c, t] < 1:
+                part = without_part(scene.mask(name, t), shares[c, t], direction)
+                write_png(copy.mask_path(name, t), np.where(part, 255, 0).astype(np.uint8))

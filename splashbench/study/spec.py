@@ -37,7 +37,7 @@ class _Model(BaseModel):
 
 
 class SceneEntry(_Model):
-    """A scene by its folder; in tables it is called `name`, its own where none is given."""
+    """A scene by its folder. Tables call it `name`; by default the name that the scene gives itself."""
 
     path: str
     name: str | None = Field(default=None, pattern=_NAME)
@@ -113,21 +113,21 @@ class StudySpec(_Model):
     @field_validator("metrics")
     @classmethod
     def _known_metrics(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        known = [*METRICS, *DERIVED]
+        names = [*METRICS, *DERIVED]
         for name in value:
             if name in RENAMED_FIGURES:
                 raise ValueError(f"metric {name!r} is called {RENAMED_FIGURES[name]!r} now; change the name")
-            if name not in known:
-                raise ValueError(f"there is no metric {name!r}{_near(name, known)}")
+            if name not in names:
+                raise ValueError(f"there is no metric {name!r}{_near(name, names)}")
         return value
 
     @model_validator(mode="after")
     def _consistent(self) -> StudySpec:
         names = self.names
         for what, values in (("variant", names), ("seed", self.seeds), ("metric", self.metrics)):
-            twice = next((value for value in values if list(values).count(value) > 1), None)
-            if twice is not None:
-                raise ValueError(f"{what} {twice} is listed twice")
+            repeated = next((value for value in values if list(values).count(value) > 1), None)
+            if repeated is not None:
+                raise ValueError(f"{what} {repeated} is listed twice")
         if self.baseline not in names:
             raise ValueError(f"baseline {self.baseline!r} is no variant{_near(self.baseline, names)}")
         if self.reference is not None and self.reference.method in names:
@@ -161,7 +161,7 @@ def load_spec(
     seeds: Sequence[int] = (),
     base: Mapping[str, Any] | None = None,
 ) -> StudySpec:
-    """The spec shipped as `name`, or in the file `name`; what is given besides replaces or adds to what it says.
+    """The spec shipped as `name`, or in the file `name`. `scenes` and `seeds` replace its own, `base` adds to its own.
 
     Paths in a file are relative to the file. Raises SplashbenchError, one line, for what is wrong with it.
     """
@@ -201,9 +201,9 @@ def metric_of(name: str) -> Metric:
     return DERIVED[name][0] if name in DERIVED else METRICS[name]
 
 
-def _near(name: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f", did you mean {near[0]!r}?" if near else ""
+def _near(name: str, names: list[str]) -> str:
+    matches = difflib.get_close_matches(name, names, n=1)
+    return f", did you mean {matches[0]!r}?" if matches else ""
 
 
 def _list(names: list[str]) -> str:

@@ -1,6 +1,6 @@
 """A study's table as Markdown: what was run, on what and with what budget, figures, differences, failures.
 
-The paper's figures stand in a table of their own: they were had on other scenes and another machine.
+The paper's figures stand in a table of their own: they are of other scenes and another machine.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fewer training views: nested subsets that keep every test view between two of them (paper, supplement, Table S6).
 
-The paper does not name its subsets. Here one training camera after another goes, each time the one whose absence
-widens least the gaps that the test views lie in.
+The paper does not name its subsets. Here training cameras are dropped one by one. Each time it is the camera whose
+absence least widens the gaps that the test views lie in.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ def nested_views(scene: Scene, count: int) -> tuple[str, ...]:
     if count > len(scene.train):
         raise SplashbenchError(f"{scene.directory} has {len(scene.train)} training views, not {count}; ask for fewer")
     angle = azimuths(scene)
-    kept = list(scene.train)
-    while len(kept) > count:
-        fewer = {name: [other for other in kept if other != name] for name in kept}
-        widths = {name: _gaps(angle, left, scene.test) for name, left in fewer.items()}
-        # Of equals the last one in the scene's order goes: the order in which cameras were listed decides nothing else.
-        gone = min(reversed(kept), key=lambda name: widths[name])
-        if not np.isfinite(widths[gone]):
+    views = list(scene.train)
+    while len(views) > count:
+        without = {name: [other for other in views if other != name] for name in views}
+        widths = {name: _gaps(angle, rest, scene.test) for name, rest in without.items()}
+        # Ties: the last camera in the scene's order is dropped. That order decides nothing else.
+        dropped = min(reversed(views), key=lambda name: widths[name])
+        if not np.isfinite(widths[dropped]):
             raise SplashbenchError(
-                f"{scene.directory}: no {len(kept) - 1} training views have every test view between them; "
+                f"{scene.directory}: no {len(views) - 1} training views have every test view between them; "
                 "name the views to keep"
             )
-        kept = fewer[gone]
-    return tuple(kept)
+        views = without[dropped]
+    return tuple(views)
 
 
 def _gaps(angle: dict[str, float], train: list[str], test: tuple[str, ...]) -> float:

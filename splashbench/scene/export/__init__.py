@@ -53,7 +53,7 @@ def export_scene(
         test_images: whether test views have no images, black ones, or their own, which are the ground truth.
         masks: whether the liquid masks of all views that have true images are written too.
 
-    Raises SplashbenchError for a camera that the format cannot say, or without any points.
+    Raises SplashbenchError for a camera that the format cannot express, and where there are no points.
     """
     if not len(points.cloud()):
         raise SplashbenchError(
@@ -70,7 +70,7 @@ def export_scene(
 
 
 def remarks(scene: Scene, format_name: str, out: Path) -> list[str]:
-    """What the user of an export should know: where the scene says more than the format, or than its readers read."""
+    """What an export loses: where the scene holds more than the format, or than the codes that read it use."""
     lines = []
     if scene.times_source == "nominal":
         lines.append("the scene has no timestamps; times are an order, not seconds")

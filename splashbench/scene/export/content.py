@@ -1,7 +1,7 @@
 """What every export of a scene shares: which views have pixels, when they were taken, and initial points.
 
-An export is what somebody else's code reads. It holds pixels of the training views only: test views are in it as poses
-and times, unless their images are asked for.
+Other people's codes read an export. It holds pixels of training views only. Test views are poses and times, unless
+their images are asked for.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Our own files in every export: what it is of (splashbench.json), and what to render (test_views.json)."""
+"""Two files in every export: what it was made from (splashbench.json), and what to render (test_views.json)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from splashbench.scene.camera import Camera
 from splashbench.scene.export.content import Export, TestImages, max_static
 
-#: By which an export is told from any other folder.
+#: The file by which an export is recognised.
 FACTS = "splashbench.json"
 TEST_VIEWS = "test_views.json"
 

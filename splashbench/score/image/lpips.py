@@ -103,9 +103,9 @@ def load_lpips(path: Path | None = None) -> tuple[Lpips | None, str]:
     Args:
         path: an .npz with conv1..5.weight/.bias and lin0..4; None looks at the environment, then at installed packages.
     """
-    given = path or os.environ.get(WEIGHTS_VARIABLE)
-    if given:
-        return Lpips(read_npz(Path(given), _RANKS)), ""
+    weights_file = path or os.environ.get(WEIGHTS_VARIABLE)
+    if weights_file:
+        return Lpips(read_npz(Path(weights_file), _RANKS)), ""
     heads = _lpips_package_file()
     if heads is None:
         return (

@@ -1,7 +1,7 @@
 """Where the liquid is drawn: mIoU@0.5 (paper, "Ablation Study") and spill (docs/protocol.md).
 
-Image metrics masked by the ground truth cannot see haze outside the silhouette, the baselines' main defect; spill is
-what they miss.
+Image metrics masked by the ground truth cannot see haze outside the silhouette, the baselines' main defect. Spill
+measures it.
 """
 
 from __future__ import annotations

@@ -43,8 +43,7 @@ def score_views(
         submission, reference: give `rendering(camera, t)` and `alpha(camera, t)`; reference is the control `nothing`.
         lpips: the metric, or None for the reason `no_lpips`.
 
-    Where the submission withheld timesteps from its method, those alone count, but for the jitter error, which is of
-    the whole sequence.
+    Of a submission with withheld timesteps, only those are scored; the jitter error covers the whole sequence.
     """
     scored = set(scored_timesteps(scene.n_frames, submission.identity.withheld))
     per_view: dict[str, dict[str, list[float | None]]] = {name: {} for name in _PER_FRAME}
@@ -57,9 +56,9 @@ def score_views(
         for name in _PER_FRAME:
             per_view[name][camera] = [row.get(name) if t in scored else None for t, row in enumerate(rows)]
         jitter[camera] = jitter_error.value()
-    few = f"no test view has a frame with {protocol.min_mask_pixels} mask pixels"
+    too_small = f"no test view has a frame with {protocol.min_mask_pixels} mask pixels"
     left_out = (scene.n_frames - len(scored)) * len(scene.test)
-    values = {name: _averaged(name, views, few, left_out) for name, views in per_view.items()}
+    values = {name: _averaged(name, views, too_small, left_out) for name, views in per_view.items()}
     values["jitter_error"] = _jitter_value(jitter)
     if reference is None:
         values |= {name: metric_value(name, None, _NO_REFERENCE) for name in _NEEDS_REFERENCE}
@@ -78,7 +77,7 @@ def _score_frame(
     t: int,
     jitter_error: JitterError,
 ) -> dict[str, float]:
-    """The metrics one frame has; those it is too empty for are left out."""
+    """The metrics of one frame, without those that need more liquid than it shows."""
     camera = scene.cameras[name]
     truth, mask = _unit(scene.image(name, t)), scene.mask(name, t)
     render = _unit(_checked(submission.rendering(name, t), camera, t, "rendering"))
@@ -109,13 +108,13 @@ def _unit(image: NDArray[np.uint8]) -> Image:
 
 
 def _checked(array: NDArray, camera: Camera, t: int, what: str) -> NDArray:
-    """`array` if it has the camera's size and, where not 8-bit, values in [0, 1]: anything else is no score."""
+    """`array` if it has the camera's size and, unless 8-bit, values in [0, 1]. Raises SplashbenchError else."""
     size = (camera.height, camera.width)
-    wanted = size if what == "alpha" else (*size, 3)
-    if array.shape != wanted:
+    expected = size if what == "alpha" else (*size, 3)
+    if array.shape != expected:
         raise SplashbenchError(
             f"{what} of camera {camera.name}, frame {t} is {'x'.join(map(str, array.shape))}, not "
-            f"{'x'.join(map(str, wanted))}; look the submission over with `splashbench check`"
+            f"{'x'.join(map(str, expected))}; look the submission over with `splashbench check`"
         )
     if array.dtype != np.uint8 and not (array.min() >= 0 and array.max() <= 1):
         raise SplashbenchError(f"{what} of camera {camera.name}, frame {t} leaves [0, 1]; write the submission again")
@@ -125,7 +124,7 @@ def _checked(array: NDArray, camera: Camera, t: int, what: str) -> NDArray:
 def _averaged(name: str, views: dict[str, list[float | None]], reason: str, left_out: int) -> MetricValue:
     """Mean over each view's frames that have a value, then over the views that have one.
 
-    left_out: frames of all views that were not to be scored, which are not skipped ones.
+    left_out: number of (frame, view) pairs that are not to be scored; they do not count as skipped.
     """
     detailed = {camera: ViewValues(value=mean(frames), frames=tuple(frames)) for camera, frames in views.items()}
     skipped = sum(frame is None for frames in views.values() for frame in frames) - left_out

@@ -1,7 +1,7 @@
 """SPH density of the particles: sigma_D and mu_D (paper, supplement, "Evaluation Protocol").
 
-Incompressible liquid has the same density everywhere, so the spread sigma_D should be small. It can be gamed by scale,
-though; rank by the uniformity index (uniformity.py).
+Incompressible liquid has the same density everywhere, so the spread sigma_D should be small. A smaller cloud lowers it
+too, so methods are ranked by the uniformity index (uniformity.py).
 """
 
 from __future__ import annotations

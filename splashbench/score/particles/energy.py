@@ -59,11 +59,11 @@ def energy_deviation(
         second, rounding_second = _half_step_energy(now, after, times[t + 1] - times[t], up, g)
         change = float(np.mean(second - first))
         changes.append(0.0 if abs(change) <= rounding_first + rounding_second else change)
-    known = np.array([change for change in changes if change is not None])
-    if known.size == 0:
+    measured = np.array([change for change in changes if change is not None])
+    if measured.size == 0:
         return None
-    total = float(np.abs(known).sum())
-    value = 0.0 if total == 0 else float(np.maximum(known, 0).sum()) / total
+    total = float(np.abs(measured).sum())
+    value = 0.0 if total == 0 else float(np.maximum(measured, 0).sum()) / total
     return EnergyChange(value, (None, *changes, None))
 
 

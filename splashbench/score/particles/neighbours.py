@@ -1,8 +1,8 @@
 """Sums over the nearest neighbours of every particle, by a list of cells: exact, and faster than a k-d tree.
 
 Points are sorted into cubic cells small enough that the cells around a point hold little more than the neighbours it
-needs. Where they hold fewer, the block of cells grows, and at last is given up for all points: clumps, sheets and stray
-points cost time, not accuracy.
+needs. Where they hold fewer, the block of cells grows, at last to all points. Clumps, sheets and stray points cost
+time, not accuracy.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _PER_NEIGHBOUR = 0.5
 _SHRINKINGS = 12
 #: Cells along an axis at most, around the middle of the points, so that a cell's number fits 64 bits; points beyond
 #: count as in the outermost.
-_MOST_CELLS = 1 << 20
+_MAX_CELLS = 1 << 20
 #: Of a cell's edge: more than rounding can be off by in telling which of so many cells a point is in.
 _MARGIN = 1e-9
 #: The block's half width at most, in cells, before all points are looked at.
 _WIDEST = 3
-_FEWEST_POINTS_PER_THREAD = 512
+_MIN_POINTS_PER_THREAD = 512
 
 
 def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: float) -> NDArray[np.float64]:
@@ -54,7 +54,7 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
         neighbours,
         radius,
         sums,
-        smallest=_FEWEST_POINTS_PER_THREAD,
+        smallest=_MIN_POINTS_PER_THREAD,
     )
     result = np.empty_like(sums)
     result[order] = sums
@@ -63,7 +63,7 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
 
 def _cells(offsets: NDArray[np.float64], size: float) -> NDArray[np.int64]:
     """Cell [N, 3] of each of `offsets` [N, 3] from the middle, counted from 0."""
-    half = _MOST_CELLS // 2
+    half = _MAX_CELLS // 2
     cells = np.clip(np.floor(offsets / size), -half, half - 1).astype(np.int64)
     return cells - cells.min(axis=0)
 
@@ -73,17 +73,17 @@ def _keys(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int6
     return (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
 
 
-def _cell_size(offsets: NDArray[np.float64], wanted: float, radius: float) -> float:
+def _cell_size(offsets: NDArray[np.float64], target: float, radius: float) -> float:
     """Edge of cells that hold about `wanted` points where the median point is; hardly above `radius` at most."""
     size = (1 + 2 * _MARGIN) * radius
     for _ in range(_SHRINKINGS):
         cells = _cells(offsets, size)
         _, inverse, counts = np.unique(_keys(cells, cells.max(axis=0) + 1), return_inverse=True, return_counts=True)
-        held = float(np.median(counts[inverse]))
-        if held <= 1.3 * wanted:
+        median_count = float(np.median(counts[inverse]))
+        if median_count <= 1.3 * target:
             break
         # Between a sheet's square and a volume's cube.
-        size *= max(0.25, (wanted / held) ** 0.4)
+        size *= max(0.25, (target / median_count) ** 0.4)
     return size
 
 
@@ -102,24 +102,24 @@ def _first(keys: np.ndarray, key: int) -> int:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _collect(
-    points: np.ndarray, number: int, first: int, last: int, limit: float, squares: np.ndarray, found: int
+    points: np.ndarray, number: int, first: int, last: int, limit: float, squares: np.ndarray, count: int
 ) -> int:
-    """Append to `squares` the squared distances below `limit` of point `number` to points[first:last].
+    """Append to `squares` the squared distances below `limit` of point `number` to points[first:last]; the new count.
 
-    One element more than are found has to have room.
+    count: elements that `squares` holds already. It needs room for one element more than are appended.
     """
     x, y, z = points[number, 0], points[number, 1], points[number, 2]
     for other in range(first, last):
         dx, dy, dz = points[other, 0] - x, points[other, 1] - y, points[other, 2] - z
         square = dx * dx + dy * dy + dz * dz
         # Written whether or not it counts: a branch would be guessed wrong every other time.
-        squares[found] = square
-        found += (square < limit) & (other != number)
-    return found
+        squares[count] = square
+        count += (square < limit) & (other != number)
+    return count
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _smallest_first(values: np.ndarray, count: int, wanted: int) -> None:
+def _smallest_first(values: np.ndarray, count: int, n_smallest: int) -> None:
     """Reorder values[:count] so that the `wanted` smallest come first (Hoare's selection)."""
     low, high = 0, count - 1
     while low < high:
@@ -134,9 +134,9 @@ def _smallest_first(values: np.ndarray, count: int, wanted: int) -> None:
                 values[i], values[j] = values[j], values[i]
                 i += 1
                 j -= 1
-        if wanted - 1 <= j:
+        if n_smallest - 1 <= j:
             high = j
-        elif wanted - 1 >= i:
+        elif n_smallest - 1 >= i:
             low = i
         else:
             return
@@ -161,11 +161,11 @@ def _sum_nearest(
     firsts, lasts = np.empty(rows, np.int64), np.empty(rows, np.int64)
     of_cell, of_half, n_rows = -1, 0, 0  # whose rows of cells these are
     for number in range(start, stop):
-        found = 0
+        count = 0
         half = 1
         while True:
             if half > _WIDEST:
-                found = _collect(points, number, 0, len(points), radius * radius, squares, 0)
+                count = _collect(points, number, 0, len(points), radius * radius, squares, 0)
                 break
             if of_cell != keys[number] or of_half != half:
                 of_cell, of_half, n_rows = keys[number], half, 0
@@ -178,19 +178,19 @@ def _sum_nearest(
                         n_rows += 1
             # Whatever is nearer than this is in the block.
             reach = min((1 - _MARGIN) * half * size, radius)
-            found = looked_at = 0
+            count = looked_at = 0
             for n in range(n_rows):
                 looked_at += lasts[n] - firsts[n]
-                found = _collect(points, number, firsts[n], lasts[n], reach * reach, squares, found)
-            if found >= neighbours or reach >= radius:
+                count = _collect(points, number, firsts[n], lasts[n], reach * reach, squares, count)
+            if count >= neighbours or reach >= radius:
                 break
             # A wider block is of use only while there is something around this one.
             half = half + 1 if looked_at < len(points) else _WIDEST + 1
-        if found > neighbours:
-            _smallest_first(squares, found, neighbours)
-            found = neighbours
+        if count > neighbours:
+            _smallest_first(squares, count, neighbours)
+            count = neighbours
         total = 0.0
-        for k in range(found):
+        for k in range(count):
             inner = radius * radius - squares[k]
             total += inner * inner * inner
         sums[number] = total

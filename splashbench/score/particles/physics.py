@@ -79,12 +79,12 @@ def _density_values(
         uniformity.append(
             frame_uniformity(density, distance, t, scale, protocol) if density is not None and distance else None
         )
-    few = f"no frame has {protocol.neighbours + 1} particles"
-    thin = no_distance or f"{few}, with neighbours within h, and observed liquid thick enough for the grid"
+    too_few = f"no frame has {protocol.neighbours + 1} particles"
+    too_thin = no_distance or f"{too_few}, with neighbours within h, and observed liquid thick enough for the grid"
     return {
-        "sigma_d": frame_mean("sigma_d", [d.sigma if d else None for d in densities], few),
-        "mu_d": frame_mean("mu_d", [d.mu if d else None for d in densities], few),
-        "uniformity": frame_mean("uniformity", uniformity, thin),
+        "sigma_d": frame_mean("sigma_d", [d.sigma if d else None for d in densities], too_few),
+        "mu_d": frame_mean("mu_d", [d.mu if d else None for d in densities], too_few),
+        "uniformity": frame_mean("uniformity", uniformity, too_thin),
     }
 
 

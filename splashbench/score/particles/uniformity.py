@@ -49,16 +49,16 @@ def shell_points(fields: DistanceFields, t: int, count: int, depth: float) -> Po
     if len(nodes) == 0:
         return None
     rng = np.random.default_rng([t, count])
-    kept: list[Points] = []
-    found = 0
+    batches: list[Points] = []
+    n_points = 0
     for _ in range(_MAX_ROUNDS):
         corner = nodes[rng.integers(len(nodes), size=2 * count)] + rng.uniform(-0.5, 0.5, (2 * count, 3))
         points = fields.origin + fields.voxel * corner
         value = fields.sample(t, points)
-        kept.append(points[(value <= 0) & (value >= -depth)])
-        found += len(kept[-1])
-        if found >= count:
-            return np.concatenate(kept)[:count]
+        batches.append(points[(value <= 0) & (value >= -depth)])
+        n_points += len(batches[-1])
+        if n_points >= count:
+            return np.concatenate(batches)[:count]
     return None
 
 

@@ -1,7 +1,7 @@
 """Metrics against the true particles of a synthetic scene: geometry and motion (docs/protocol.md, "Against the truth").
 
-The grid is the one that the training masks give (observe/signed_distance.py), and every length is in its voxels. What
-the reconstruction is: the signed distance that the submission hands in, else the liquid that its particles stand for.
+The grid is the one that the training masks give (observe/signed_distance.py), and every length is in its voxels. The
+reconstruction is the submission's signed distance, else the liquid that its particles represent.
 """
 
 from __future__ import annotations

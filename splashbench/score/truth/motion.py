@@ -1,7 +1,7 @@
 """Endpoint error of a reconstruction's velocities against those of the true particles (docs/protocol.md).
 
-Looked at are the true particles near the true surface, where a camera can see motion, as far as the reconstruction has
-a particle near them; how many those are is a figure of its own, so that nobody gains by leaving the hard ones out.
+The error covers true particles near the true surface, where a camera can see motion, that have a reconstructed particle
+near them. Their share is a metric of its own, so that nobody gains by leaving the hard ones out.
 """
 
 from __future__ import annotations
