@@ -1,4 +1,4 @@
-"""Progress bars for whatever takes over two seconds; they go to standard error, so `--json` output stays clean."""
+"""Progress bars for work of more than two seconds, on standard error, so that `--json` output stays clean."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _LOG_INTERVAL_SECONDS = 10.0
 
 
 def track(iterable: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """Yield from `iterable` while showing on standard error how far it is, labelled `description`.
+    """Yield from `iterable` and show progress on standard error, labelled `description`.
 
-    Without a terminal it prints a line every ten seconds instead of a bar: logs are read as lines.
+    `total` is the number of items, where `iterable` has no length. Without a terminal, a line is printed every ten
+    seconds instead of a bar: logs are read as lines.
     """
     if sys.stderr.isatty():
         from tqdm import tqdm
@@ -24,25 +25,25 @@ def track(iterable: Iterable[T], description: str, total: int | None = None) -> 
         return
     if total is None and isinstance(iterable, Sized):
         total = len(iterable)
-    told = time.monotonic()
+    last_line = time.monotonic()
     for done, item in enumerate(iterable):
-        if time.monotonic() - told >= _LOG_INTERVAL_SECONDS:
-            told = time.monotonic()
+        if time.monotonic() - last_line >= _LOG_INTERVAL_SECONDS:
+            last_line = time.monotonic()
             print(f"{description}: {done}{f' of {total}' if total else ''}", file=sys.stderr, flush=True)
         yield item
 
 
 class Bar:
-    """A bar that follows a fraction in [0, 1] reported from elsewhere (a method in its child process).
+    """A bar that follows a fraction in [0, 1], such as a method reports from its child process.
 
-    Without a terminal it prints a line every ten seconds instead: logs are read as lines. With `keep` false it leaves
-    no line behind on the terminal, for bars between lines of other text.
+    Without a terminal, a line is printed every ten seconds instead: logs are read as lines. With `keep` false the bar
+    disappears when it is closed, for bars between lines of other text.
     """
 
     def __init__(self, description: str, keep: bool = True) -> None:
         self._description = description
         self._bar: Any = None
-        self._told = time.monotonic()
+        self._last_line = time.monotonic()
         if sys.stderr.isatty():
             from tqdm import tqdm
 
@@ -50,13 +51,13 @@ class Bar:
             self._bar = tqdm(total=1.0, desc=description, file=sys.stderr, ncols=90, bar_format=form, leave=keep)
 
     def update(self, fraction: float, message: str = "") -> None:
-        """Move to `fraction` (never backwards) and show `message` behind the bar."""
+        """Move the bar to `fraction`, never backwards, and show `message` behind it."""
         if self._bar is not None:
             step = min(1.0, fraction) - self._bar.n
             self._bar.set_postfix_str(message[:40], refresh=False)
             self._bar.update(max(0.0, step))
-        elif time.monotonic() - self._told >= _LOG_INTERVAL_SECONDS:
-            self._told = time.monotonic()
+        elif time.monotonic() - self._last_line >= _LOG_INTERVAL_SECONDS:
+            self._last_line = time.monotonic()
             print(f"{self._description}: {fraction:4.0%} {message}".rstrip(), file=sys.stderr, flush=True)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""TOML in and out: the standard library's reader (or its backport on Python 3.10) and the tomli-w writer."""
+"""TOML files: read by the standard library (its backport on Python 3.10), written by tomli-w."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def test_what_is_no_array_in_an_archive_is_named(tmp_path: Path) -> None:
     path = tmp_path / "odd.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.npy", b"not an array")
-    with pytest.raises(SplashbenchError, match=r"odd\.npz: a is no array"):
+    with pytest.raises(SplashbenchError, match=r"odd\.npz: a is not an array"):
         read_npz(path, {"a": 1})
 
 

@@ -1,1 +1,1 @@
-"""The command line, one module per command (splashbench/cli/main.py)."""
+"""The command line, one module or package per command; main.py starts it."""

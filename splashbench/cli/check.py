@@ -1,4 +1,4 @@
-"""`splashbench check SUBMISSION`: every fault of a submission at once."""
+"""`splashbench check SUBMISSION`: list every fault of a submission at once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     scene = Scene.open(arguments.scene) if arguments.scene else None
     faults = check_submission(arguments.submission, scene)
     if not faults:
-        # Whole, but nothing to score: a person who checks wants to know.
+        # Complete, but nothing to score: a person who checks wants to know.
         record = Submission.open(arguments.submission, verify=False).record
         if record.status != Status.OK:
             say(f"{arguments.submission}: the run ended with status {record.status.value}: {one_line(record.reason)}")

@@ -1,7 +1,7 @@
-"""`splashbench demo OUT`: the whole road once, on a made-up pour with exact ground truth.
+"""`splashbench demo OUT`: every step once, on a synthetic pour with exact ground truth.
 
-Every step is an ordinary command, printed before it runs, so that a newcomer can type it again. Steps whose output is
-there already are kept: each output is written whole or not at all, so what exists is complete.
+Every step is an ordinary command and is printed before it runs, so that a newcomer can type it again. A step whose
+output exists is skipped: outputs are written whole or not at all, so what exists is complete.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _EPILOG = """\
 example:
   splashbench demo demo_output
 
-Seven minutes on two shared cores of a server. Look at demo_output/README.txt afterwards.
+Takes seven minutes on two shared cores. Read demo_output/README.txt afterwards.
 """
 
-#: In the folder of a demo, begun or whole.
+#: Marks the folder of a demo, finished or not.
 _MARK = ".splashbench_demo"
 
 #: id, preset and further options of the runs; the oracle is written by the harness.
@@ -50,7 +50,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder for everything the demo makes")
     add_seed(parser, "seed of the synthetic pour and of the methods")
-    parser.add_argument("--fresh", action="store_true", help="make everything anew, also what is there already")
+    parser.add_argument("--fresh", action="store_true", help="make everything again, existing outputs included")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     sheet, runs = out / "contact_sheet.png", {name: out / "submissions" / name for name, _ in _RUNS}
 
     steps = _Steps(arguments.fresh)
-    steps.run("film a made-up pour", session, ["synth", "session", str(session), *seed])
+    steps.run("film a synthetic pour", session, ["synth", "session", str(session), *seed])
     steps.run("prepare the scene", scene, ["prepare", str(session), str(scene)])
     steps.run("compare it with the truth", truth, ["synth", "verify", str(session), str(scene), "--out", str(truth)])
     for name, options in _RUNS:
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _claim(out: Path) -> None:
-    """Mark `out` as the demo's own. What it makes anew it removes first, so another folder must not be taken for it."""
+    """Mark `out` as the demo's own: it removes outputs that it makes again, so it must never take another folder."""
     from splashbench.errors import SplashbenchError
     from splashbench.files import require_folder_place, write_text
 
@@ -106,20 +106,20 @@ def _claim(out: Path) -> None:
 
 
 class _Steps:
-    """Runs commands in order; once one was run afresh, everything after it is too."""
+    """Runs commands in order. Once one has run, every later one runs too: its input has changed."""
 
     def __init__(self, fresh: bool) -> None:
         self._fresh = fresh
         self._count = 0
 
     def run(self, title: str, output: Path, command: list[str], stale: tuple[Path, ...] = ()) -> None:
-        """Run `command` unless its whole `output` is there and nothing before it has changed.
+        """Run `command` unless its `output` exists and no earlier step has run.
 
-        Before it runs, `output` and `stale` are removed: the demo made them, and they are of an earlier run.
+        `output` and `stale` are removed first: they are the demo's own, from an earlier run.
         """
         if output.exists() and not self._fresh:
             self._count += 1
-            say(f"\n[{self._count}] {title}: found {output}, kept")
+            say(f"\n[{self._count}] {title}: skipped, {output} exists")
             return
         self._fresh = True
         for path in (output, *stale):
@@ -145,7 +145,7 @@ class _Steps:
 
 @dataclass
 class _Gate:
-    """One thing the demo promises."""
+    """A figure that the demo promises, with its limit."""
 
     name: str
     value: float | None
@@ -165,17 +165,17 @@ class _Gate:
 
 
 def _gates(truth: Path, results: Path) -> list[_Gate]:
-    """What came out against what the demo promises."""
+    """The figures that the demo promises, with their limits."""
     from splashbench.files import read_json
     from splashbench.score.result import Result
 
-    found = read_json(truth)["cameras"].values()
+    cameras = read_json(truth)["cameras"].values()
     scores = {result.method: result for result in map(Result.load, sorted(results.glob("*.json")))}
     return [
-        _Gate("largest sync error, ms", max(abs(camera["sync_error_ms"]) for camera in found), 1.0, True),
-        _Gate("largest focal error, %", max(abs(camera["focal_error_percent"]) for camera in found), 1.0, True),
-        _Gate("cameras posed", len(found), 7, False),
-        _Gate("mean rotation error, degrees", fmean(camera["rotation_error_deg"] for camera in found), 0.2, True),
+        _Gate("largest sync error, ms", max(abs(camera["sync_error_ms"]) for camera in cameras), 1.0, True),
+        _Gate("largest focal error, %", max(abs(camera["focal_error_percent"]) for camera in cameras), 1.0, True),
+        _Gate("cameras posed", len(cameras), 7, False),
+        _Gate("mean rotation error, degrees", fmean(camera["rotation_error_deg"] for camera in cameras), 0.2, True),
         _Gate("splashsplat, PSNR over nothing, dB", scores["splashsplat"].value("dpsnr_bg"), 1.0, False),
         _Gate("splashsplat, mIoU", scores["splashsplat"].value("miou"), 0.6, False),
         _Gate("oracle, PSNR, dB", scores["oracle"].value("psnr"), 100.0, False),
@@ -185,12 +185,12 @@ def _gates(truth: Path, results: Path) -> list[_Gate]:
 
 
 def _summary(out: Path, gates: list[_Gate], seconds: float) -> str:
-    """The figures, and where to look."""
+    """The text of README.txt: the figures, and where to look."""
     return "\n".join(
         [
             f"splashbench demo, {seconds / 60:.1f} minutes in this run",
             "",
-            table(["what", "value", "wanted", ""], [gate.row() for gate in gates]),
+            table(["check", "value", "limit", ""], [gate.row() for gate in gates]),
             "",
             "look at",
             f"  {out / 'contact_sheet.png'}    truth, renders and foreground opacity at the test views",

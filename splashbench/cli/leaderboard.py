@@ -1,4 +1,4 @@
-"""`splashbench leaderboard RESULTS OUT`: table and charts from a folder of results."""
+"""`splashbench leaderboard RESULTS OUT`: make tables and charts from a folder of results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("results", type=Path, metavar="RESULTS", help="folder with results, from `splashbench score`")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder the leaderboard is written into")
-    parser.add_argument("--with-paper", action="store_true", help="the paper's figures, as reported, beside them")
+    parser.add_argument("--with-paper", action="store_true", help="add the paper's figures, as reported")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,11 +43,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     sources = load_results(arguments.results)
     table = leaderboard_table(sources)
-    # All four or none: a table without its chart would be taken for whole.
+    # All four files or none: a table without its chart would look complete.
     with files_together(arguments.out) as staging:
-        made = write_leaderboard(table, sources, staging, with_paper=arguments.with_paper)
-        made += speed_accuracy_chart(sources, staging, with_paper=arguments.with_paper)
-    files = [arguments.out / path.name for path in made]
+        paths = write_leaderboard(table, sources, staging, with_paper=arguments.with_paper)
+        paths += speed_accuracy_chart(sources, staging, with_paper=arguments.with_paper)
+    files = [arguments.out / path.name for path in paths]
     failed = int(table["failed"].sum())
     say(f"{len(sources)} results, {len(table)} rows{f', {failed} of them failed runs' if failed else ''}")
     for file in files:

@@ -1,8 +1,13 @@
 """The command line `splashbench`: a thin shell around the library, one module per command.
 
-Command modules import what they need inside their handlers, so that `--help` answers at once. Exit status: 0 done,
-1 failed with one line saying what and what to do, 2 wrong usage; 130 interrupted, 143 terminated, 141 the reader of its
-output went away.
+Command modules import what they need inside their handlers, so that `--help` answers at once. Exit status:
+
+    0    done
+    1    failed; one line says what is wrong and what to do
+    2    wrong usage
+    130  interrupted
+    141  the reader of its output went away
+    143  terminated
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ the usual order:
   splashbench run splashsplat SCENE SUBMISSION      reconstruct
   splashbench score SUBMISSION --scene SCENE --out RESULTS
   splashbench leaderboard RESULTS OUT               CSV, table and charts
-  splashbench study run ablation OUT --scenes SCENE...       many runs in one table
+  splashbench study run ablation OUT --scenes SCENE     many runs in one table
 """
 
 
@@ -60,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
     # Started with closed streams, as some schedulers do, Python has none.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
-    # A name in letters that the charts' font lacks is drawn as boxes; that is no news for the terminal.
+    # Letters that the charts' font lacks are drawn as boxes; a warning on the terminal helps nobody.
     warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
     try:
         with terminable():
@@ -79,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
             print("\ninterrupted; nothing half-written was left", file=sys.stderr)
         return 128 + (error.signum if isinstance(error, Terminated) else signal.SIGINT)
     except BrokenPipeError:
-        # The reader of our output went away (`| head`): the status that a shell gives to any tool then.
+        # The reader of our output went away (`| head`); a shell gives any tool this status then.
         _drop_output()
         return 141
     except MemoryError as error:

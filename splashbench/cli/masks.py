@@ -1,4 +1,4 @@
-"""`splashbench masks compare|sheet`: raw against refined masks in the paper's figures, and masks for a person's eye."""
+"""`splashbench masks compare|sheet`: compare two sets of masks as the paper does, or draw one for a person."""
 
 from __future__ import annotations
 
@@ -107,12 +107,12 @@ def compare(arguments: argparse.Namespace) -> int:
 
 
 def _require_apart(out: Path, inputs: Iterable[Path | None]) -> None:
-    """Raise SplashbenchError where an output would lie among the masks or images that are looked at."""
+    """Raise SplashbenchError where an output would lie among the masks or images that are read."""
     from splashbench.errors import SplashbenchError
 
     for source in inputs:
         if source is not None and out.resolve().is_relative_to(source.resolve()):
-            raise SplashbenchError(f"{out} lies in {source}, which is looked at; give another place for the output")
+            raise SplashbenchError(f"{out} lies in {source}, which is read; give another place for the output")
 
 
 def _row(scene: str, camera: str, change: MaskChange) -> list[str]:
@@ -158,11 +158,11 @@ def sheet(arguments: argparse.Namespace) -> int:
     write_png(arguments.out, picture)
     for remark in remarks:
         say(f"note: {remark}")
-    for camera, found in faults.items():
-        for t, reason in found.items():
+    for camera, reasons in faults.items():
+        for t, reason in reasons.items():
             say(f"camera {camera}, frame {t}: {reason}")
     say(f"wrote {arguments.out}: {sum(map(len, faults.values()))} masks empty or failed")
     if arguments.json:
-        listed = {camera: {str(t): reason for t, reason in found.items()} for camera, found in faults.items()}
-        emit({"sheet": str(arguments.out), "faults": listed, "notes": remarks})
+        fault_lists = {camera: {str(t): reason for t, reason in reasons.items()} for camera, reasons in faults.items()}
+        emit({"sheet": str(arguments.out), "faults": fault_lists, "notes": remarks})
     return 0

@@ -1,4 +1,4 @@
-"""What every command shares: printing for people on standard error, one JSON object on standard output."""
+"""Printing: text for people on standard error, one JSON object on standard output."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def say(text: str = "") -> None:
-    """Tell a person, on standard error; control characters, which may come from strangers' files, are replaced."""
+    """Print for people, on standard error. Control characters are replaced: text may come from strangers' files."""
     shown = "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
     print(shown, file=sys.stderr, flush=True)
 
 
 def emit(data: dict[str, Any]) -> None:
-    """The one JSON object of a command run with `--json`."""
+    """Print the one JSON object of a command run with `--json`. NaN and infinity raise ValueError: JSON has neither."""
     print(json.dumps(data, indent=1, allow_nan=False))
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
-    """Plain text columns, the first left-aligned and the others right-aligned."""
+    """Plain text in columns: the first left-aligned, the others right-aligned."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     lines = []
     for row in [header, *rows]:

@@ -1,4 +1,4 @@
-"""`splashbench prepare SESSION SCENE`: a raw recording to a calibrated, synchronised, masked and cropped scene."""
+"""`splashbench prepare SESSION SCENE`: make a calibrated, synchronised, masked and cropped scene of raw recordings."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from splashbench.cli.output import emit, say, table
 
 _EPILOG = """\
 examples:
-  splashbench prepare sessions/monday --init --square-metres 0.03               write session.toml by looking
+  splashbench prepare sessions/monday --init --square-metres 0.03               write session.toml
   splashbench prepare sessions/monday scenes/monday
   splashbench prepare sessions/monday scenes/monday --masks sam3_masks --interval 12.4 17.7 --replace
   splashbench prepare sessions/monday scenes/monday --from masks --replace      the masks and the scene once more
 
-SESSION holds session.toml and the cameras' own files: per camera a clip of the ChArUco board, one of the textured
-static scene with the board lying flat on the table, and the pour with sound; and a handheld sweep of the static scene.
-SCENE appears only when every essential gate is passed; its prepare_report.html shows what was found.
+SESSION holds session.toml and the cameras' own files. Each camera has three clips: the ChArUco board; the textured
+static scene with the board flat on the table; the pour, with sound. A handheld sweep shows the static scene.
+SCENE is written only where every essential gate passes. Its prepare_report.html shows every stage's outcome.
 
-With --init, SCENE is left out, and --replace is for session.toml. Folders of photographs are not looked for: add them
-by hand.
+With --init, leave SCENE out; --replace is then for session.toml. It does not look for folders of photographs: add them
+to session.toml by hand.
 
-What a stage found last is kept in SESSION/prepare. The next run does only what has changed, and goes on where one that
-was stopped had come to. Stages, in order: sync, motion, intrinsics, poses, metric, container, masks, scene.
+Results of each stage are cached in SESSION/prepare. The next run repeats only what has changed, and continues a run
+that was stopped. Stages, in order: sync, motion, intrinsics, poses, metric, container, masks, scene.
 """
 
 # As in session.toml (splashbench.prepare.session), repeated here so that `--help` need not import it.
@@ -35,7 +35,7 @@ _STAGES = ("sync", "motion", "intrinsics", "poses", "metric", "container", "mask
 
 
 class _WithoutScene(argparse.Action):
-    """A flag that makes SCENE needless. (With nargs="?" instead, no option could stand between SESSION and SCENE.)"""
+    """A flag that makes SCENE optional. (With nargs="?", no option could stand between SESSION and SCENE.)"""
 
     def __init__(self, option_strings: Sequence[str], dest: str, scene: argparse.Action, help: str) -> None:
         super().__init__(option_strings, dest, nargs=0, default=False, help=help)
@@ -62,7 +62,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         "--init",
         action=_WithoutScene,
         scene=scene,
-        help="write SESSION/session.toml by looking at the recordings, and no scene",
+        help="write SESSION/session.toml from what the recordings show, and no scene",
     )
     parser.add_argument(
         "--square-metres",
@@ -80,25 +80,29 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         "--timesteps",
         type=whole_number(2, _MAX_TIMESTEPS),
         metavar="N",
-        help="timesteps; default: as session.toml says",
+        help="number of timesteps; default: as session.toml says",
     )
     parser.add_argument(
         "--interval",
         nargs=2,
         type=float,
         metavar=("START", "END"),
-        help="motion interval in seconds on the first camera's clock; default: found in the images",
+        help="motion interval in seconds on the first camera's clock; default: detected in the images",
     )
     parser.add_argument("--no-crop", action="store_true", help="keep whole frames instead of the paper's crop")
-    parser.add_argument("--image-format", choices=("png", "jpg"), default="png", help="of the frames (default: png)")
+    parser.add_argument(
+        "--image-format", choices=("png", "jpg"), default="png", help="format of the frames (default: png)"
+    )
     parser.add_argument(
         "--from",
         dest="again_from",
         choices=_STAGES,
         metavar="STAGE",
-        help="do this stage and those after it again, although nothing has changed",
+        help="repeat this stage and those after it, although nothing has changed",
     )
-    parser.add_argument("--work", type=Path, metavar="DIR", help="where results are kept (default: SESSION/prepare)")
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR", help="cache of the stages' results (default: SESSION/prepare)"
+    )
     add_replace(parser, "SCENE")
 
 
@@ -106,26 +110,28 @@ def _describe(arguments: argparse.Namespace) -> int:
     """Handle `splashbench prepare SESSION --init`."""
     from splashbench.prepare.init.description import describe
 
-    found = describe(arguments.session, arguments.square_metres, arguments.replace)
+    description = describe(arguments.session, arguments.square_metres, arguments.replace)
     rows = [
         [video.camera or "-", video.subject or "not used", str(len(video.files)), video.files[0]]
-        for video in found.recordings
+        for video in description.recordings
     ]
     say(table(["camera", "shows", "files", "first file"], rows))
-    if found.board is not None:
-        board = found.board
+    if description.board is not None:
+        board = description.board
         say(f"board: {board.squares_x}x{board.squares_y} squares, {board.dictionary}")
-    for line in found.to_do:
+    for line in description.to_do:
         say(f"to do: {line}")
-    say(f"wrote {found.path}; check it, then run: splashbench prepare {arguments.session} SCENE")
+    say(f"wrote {description.path}; check it, then run: splashbench prepare {arguments.session} SCENE")
     if arguments.json:
         emit(
             {
-                "session": str(found.path),
-                "cameras": list(found.cameras),
-                "films": [{"camera": r.camera, "shows": r.subject, "files": list(r.files)} for r in found.recordings],
-                "board": vars(found.board) if found.board else None,
-                "to_do": list(found.to_do),
+                "session": str(description.path),
+                "cameras": list(description.cameras),
+                "films": [
+                    {"camera": r.camera, "shows": r.subject, "files": list(r.files)} for r in description.recordings
+                ],
+                "board": vars(description.board) if description.board else None,
+                "to_do": list(description.to_do),
             }
         )
     return 0
@@ -171,11 +177,11 @@ def run(arguments: argparse.Namespace) -> int:
     say(table(["gate", "value", "limit", "outcome"], rows))
     for gate in preparation.warnings:
         say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}")
-    done = {name: record.spent for name, record in preparation.stages.items() if not record.reused}
-    kept = [name for name, record in preparation.stages.items() if record.reused]
-    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in done.items())
-    as_before = f"; as before: {', '.join(kept)}" if kept else ""
-    say(f"wrote {arguments.scene} in {sum(done.values()):.0f} s ({spent}{as_before})")
+    seconds_spent = {name: record.spent for name, record in preparation.stages.items() if not record.reused}
+    reused = [name for name, record in preparation.stages.items() if record.reused]
+    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in seconds_spent.items())
+    unchanged = f"; unchanged: {', '.join(reused)}" if reused else ""
+    say(f"wrote {arguments.scene} in {sum(seconds_spent.values()):.0f} s ({spent}{unchanged})")
     if arguments.json:
         stages = {
             name: {"seconds": round(r.seconds, 3), "spent": round(r.spent, 3), "reused": r.reused}

@@ -52,16 +52,21 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         "--trained",
         type=Path,
         metavar="DIR",
-        help="instead of --command: what it left as {out} earlier, trained on this scene as `scene export` with the "
-        "same --format, --points and --blank-test-images wrote it; no fit time is recorded",
+        help="instead of --command: a model trained earlier, on this scene as `scene export` wrote it with the same "
+        "--format, --points and --blank-test-images; no fit time is recorded",
     )
     renders = parser.add_mutually_exclusive_group()
     renders.add_argument(
-        "--render-command", metavar="COMMAND", help="writes the test views into {into}, where --command does not"
+        "--render-command", metavar="COMMAND", help="writes the test views into {into}, where --command does not do it"
     )
-    renders.add_argument("--import", dest="importer", metavar="IMPORTER", help="reads {out}; a name, or FILE.py:CLASS")
+    renders.add_argument(
+        "--import",
+        dest="importer",
+        metavar="IMPORTER",
+        help="reads the model in {out}: the name of an importer, or FILE.py:CLASS",
+    )
     parser.add_argument(
-        "--shell", action="store_true", help="commands are for /bin/sh: pipes, variables, several lines"
+        "--shell", action="store_true", help="run the commands by /bin/sh: pipes, variables, several lines"
     )
     parser.add_argument(
         "--directory", type=Path, default=Path(), metavar="DIR", help="where the commands run (default: here)"
@@ -71,12 +76,14 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--mixed",
         action="store_true",
-        help="one set of primitives is background and liquid; the importers of official codes say so themselves",
+        help="the code has one set of primitives for background and liquid; importers of official codes set this",
     )
-    parser.add_argument("--blank-test-images", action="store_true", help="black images, for codes that open them")
+    parser.add_argument(
+        "--blank-test-images", action="store_true", help="export black test images, for codes that open them"
+    )
     parser.add_argument("--masks", action="store_true", help="export the training views' liquid masks too")
     add_points(parser)
-    parser.add_argument("--work", type=Path, metavar="DIR", help="a new folder that keeps export, output and logs")
+    parser.add_argument("--work", type=Path, metavar="DIR", help="a new folder for export, output and logs, which stay")
     add_run_options(parser)
 
 

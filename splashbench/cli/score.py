@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,13 +20,13 @@ examples:
   splashbench score runs/bowl_001/splashsplat --scene scenes/bowl_001 --out results
   splashbench score runs/bowl_001/* --scene scenes/bowl_001 --out results --reference runs/bowl_001/nothing
 
-Ground truth comes from SCENE alone. A run that failed becomes a result with its status and no score. --reference, the
-submission of the control `nothing` on the same scene, gives dpsnr_bg and spill_rgb. LPIPS needs weights: the option,
-the environment variable SPLASHBENCH_LPIPS_WEIGHTS, or an installed lpips package with torchvision's AlexNet cached;
-without them it is null. Where SCENE is made up and has true particles, geometry and motion are compared with them.
+Ground truth comes from SCENE alone. A failed run becomes a result with its status and without scores. --reference
+takes the submission of the control `nothing` on the same scene and gives dpsnr_bg and spill_rgb. LPIPS needs weights,
+else it is null: --lpips-weights, the environment variable SPLASHBENCH_LPIPS_WEIGHTS, or an installed lpips package with
+torchvision's AlexNet cached. Where a synthetic SCENE has true particles, geometry and motion are compared with them.
 """
 
-# The figures of the small table; the result has all of them. Those against true particles have a table of their own.
+# Columns of the printed table; a result has every metric. Those against true particles have a table of their own.
 _SHOWN = ("psnr", "dpsnr_bg", "ssim", "lpips", "miou", "spill", "jitter_error", "uniformity", "delta_e", "fit_seconds")
 
 
@@ -60,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sheet:
         require_file_place(arguments.sheet)
     scene = Scene.open(arguments.scene)
-    # All are opened, hence verified, before hours may go into scoring the first.
+    # All are opened, hence verified, first: scoring may take hours.
     submissions = [Submission.open(path) for path in arguments.submissions]
     reference = Submission.open(arguments.reference) if arguments.reference else None
     fields = shared_fields(scene, protocol)
@@ -95,24 +96,28 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _protocol(changes: list[str]) -> Protocol:
-    """Protocol v1 with the KEY=VALUE changes asked for."""
+    """Protocol v1 with the changes KEY=VALUE. Raises SplashbenchError for a setting that it does not have."""
     from pydantic import ValidationError
 
     from splashbench.errors import SplashbenchError
     from splashbench.score import Protocol
 
     values = {}
+    names = ", ".join(Protocol.model_fields)
     for change in changes:
         key, separator, value = change.partition("=")
         if not separator or not key:
-            raise SplashbenchError(f"--set {change!r} is not KEY=VALUE; known: {', '.join(Protocol.model_fields)}")
+            raise SplashbenchError(f"--set {change!r} is not KEY=VALUE; there are {names}")
+        if key not in Protocol.model_fields:
+            near = difflib.get_close_matches(key, Protocol.model_fields, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {names}"
+            raise SplashbenchError(f"--set {key}: the protocol has no such setting; {hint}")
         values[key] = value
     try:
         return Protocol.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        known = ", ".join(Protocol.model_fields)
-        raise SplashbenchError(f"--set {first['loc'][0]}: {first['msg']}; known settings: {known}") from None
+        raise SplashbenchError(f"--set {first['loc'][0]}: {first['msg']}") from None
 
 
 def _summary(results: list[Result]) -> str:

@@ -19,7 +19,7 @@ examples:
 
 SPEC is a TOML file, or one of: ablation, baselines, best, interpolation, masks, sensitivity, views
 (docs/study.md). OUT gets table.md, table.csv, runs.csv, table.json, chart.png and chart.svg. The same command again
-goes on where it stopped. Failed runs are rows.
+continues where it stopped. Failed runs have rows of their own.
 """
 
 
@@ -41,17 +41,30 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
     )
     parser.add_argument("spec", metavar="SPEC", help="a TOML file, or the name of a study that is shipped")
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; runs that are in it are kept")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; finished runs in it are reused")
     parser.add_argument(
-        "--scenes", nargs="+", action="extend", default=[], metavar="SCENE", help="folders of scenes, for the spec's"
+        "--scenes",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="SCENE",
+        help="folders of scenes, in place of the spec's",
     )
     parser.add_argument(
-        "--seeds", nargs="+", action="extend", type=whole_number(0), default=[], metavar="SEED", help="for the spec's"
+        "--seeds",
+        nargs="+",
+        action="extend",
+        type=whole_number(0),
+        default=[],
+        metavar="SEED",
+        help="seeds, in place of the spec's",
     )
     add_settings(parser, "a setting of every row, such as the number of iterations; overrides the spec's", dest="base")
     parser.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
-    parser.add_argument("--jobs", type=whole_number(1), default=1, metavar="N", help="runs at once (default 1)")
-    parser.add_argument("--retry", action="store_true", help="run again what failed")
+    parser.add_argument(
+        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
+    )
+    parser.add_argument("--retry", action="store_true", help="repeat failed runs")
     parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
     add_lpips_weights(parser)
 
@@ -85,8 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
     command = _command(arguments)
     files = write_report(table, arguments.out, command)
     failed = sum(len(row.failed) for row in table.rows)
-    kept = f", {tally.kept} were there" if tally.kept else ""
-    say(f"{tally.made} runs made{kept}; {len(table.rows)} rows, {failed} failed runs")
+    reused = f", {tally.kept} reused" if tally.kept else ""
+    say(f"{tally.made} runs made{reused}; {len(table.rows)} rows, {failed} failed runs")
     for file in files:
         say(f"wrote {file}")
     if arguments.json:
@@ -98,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _command(arguments: argparse.Namespace) -> str:
-    """The command that makes this table from nothing."""
+    """The command line that makes this table again."""
     words = ["splashbench", "study", "run", arguments.spec, str(arguments.out)]
     for flag, values in (("--scenes", arguments.scenes), ("--seeds", arguments.seeds)):
         words += [flag, *map(str, values)] if values else []

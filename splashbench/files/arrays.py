@@ -50,7 +50,7 @@ def read_npz(
         raise SplashbenchError(f"{path} is not a readable .npz without pickles ({error}); write it again") from None
     for name, array in arrays.items():
         if not isinstance(array, np.ndarray):  # numpy hands out what is no array as bytes
-            raise SplashbenchError(f"{path}: {name} is no array; write it again")
+            raise SplashbenchError(f"{path}: {name} is not an array; write it again")
         if array.ndim != ranks[name]:
             raise SplashbenchError(f"{path}: {name} has {array.ndim} dimensions, not {ranks[name]}; write it again")
         if array.dtype.kind not in "biuf":

@@ -95,14 +95,23 @@ def test_a_strangers_reason_stays_on_one_line_and_off_the_terminal(
 
 
 @pytest.mark.parametrize(
-    "change",
-    ["x", "=1", "psnr_cap_db=inf", "psnr_cap_db=nan", "grid_cells=999999999", "ssim_sigma=1e308", "nothing=1"],
+    ("change", "message"),
+    [
+        ("x", "--set 'x' is not KEY=VALUE; there are version, psnr_cap_db"),
+        ("=1", "--set '=1' is not KEY=VALUE"),
+        ("psnr_cap_db=inf", "--set psnr_cap_db: "),
+        ("psnr_cap_db=nan", "--set psnr_cap_db: "),
+        ("grid_cells=999999999", "--set grid_cells: "),
+        ("ssim_sigma=1e308", "--set ssim_sigma: "),
+        ("nothing=1", "--set nothing: the protocol has no such setting; there are version"),
+        ("grid_cell=50", "--set grid_cell: the protocol has no such setting; did you mean 'grid_cells'?"),
+    ],
 )
 def test_a_bad_setting_of_the_protocol_is_named(
-    balls_directory: Path, submission: Path, tmp_path: Path, fails: Fails, change: str
+    balls_directory: Path, submission: Path, tmp_path: Path, fails: Fails, change: str, message: str
 ) -> None:
     words = ["score", submission, "--scene", balls_directory, "--out", tmp_path / "results", "--set", change]
-    assert "--set" in fails(*words)
+    assert message in fails(*words)
     assert not (tmp_path / "results").exists()
 
 

@@ -78,8 +78,8 @@ def test_sheet_is_written_and_names_what_fails(
         (["sheet", "nowhere", "--out", "sheet.jpg"], "sheet.jpg does not end in .png"),
         (["sheet", ".", "--images", "nowhere", "--out", "../sheet.png"], "nowhere is not a folder"),
         (["sheet", ".", "--out", "../sheet.png"], "has no masks"),
-        (["sheet", ".", "--out", "sheet.png"], "sheet.png lies in ., which is looked at"),
-        (["compare", ".", ".", "--out", "comparison"], "comparison lies in ., which is looked at"),
+        (["sheet", ".", "--out", "sheet.png"], "sheet.png lies in ., which is read"),
+        (["compare", ".", ".", "--out", "comparison"], "comparison lies in ., which is read"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -160,7 +160,7 @@ def test_a_released_scene_stays_one(scene: Path, tmp_path: Path, capsys: pytest.
     assert Scene.open(released).is_released
     capsys.readouterr()
     assert main(["scene", "reconstruct-container", str(released)]) == 0
-    assert "taken to be opaque" in capsys.readouterr().err
+    assert "assumed to be opaque" in capsys.readouterr().err
     assert Scene.open(released).is_released
 
 

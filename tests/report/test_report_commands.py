@@ -94,7 +94,7 @@ def test_settings_of_the_protocol_can_be_changed_and_are_checked(
     words: list[str | Path] = ["score", runs["nothing"], "--scene", balls.directory, "--out", tmp_path]
     assert command(*words, "--set", "outside_mask=truth", "--json") == 0
     assert json.loads(capsys.readouterr().out)["protocol"].startswith("v1+")
-    with pytest.raises(SplashbenchError, match=r"--set nonsense: .*known settings: version, psnr_cap_db"):
+    with pytest.raises(SplashbenchError, match="--set nonsense: the protocol has no such setting; there are version"):
         command(*words, "--set", "nonsense=1")
     with pytest.raises(SplashbenchError, match="not KEY=VALUE"):
         command(*words, "--set", "outside_mask")

@@ -126,7 +126,7 @@ def test_the_same_command_again_runs_nothing(study: tuple[str, Path, Path], caps
     assert (out / "table.csv").read_bytes() == before
     answer = json.loads(said.out)
     assert (answer["made"], answer["kept"], answer["failed"]) == (0, 6, 1)
-    assert "0 runs made, 6 were there; 4 rows, 1 failed runs" in said.err
+    assert "0 runs made, 6 reused; 4 rows, 1 failed runs" in said.err
 
 
 def test_what_failed_is_tried_again_on_request(study: tuple[str, Path, Path]) -> None:

@@ -1,4 +1,4 @@
-"""`splashbench scene ACTION`: look a scene over, write it for other codes, give it a container."""
+"""`splashbench scene ACTION`: inspect a scene, export it for other codes, give it a container."""
 
 from __future__ import annotations
 

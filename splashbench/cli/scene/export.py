@@ -15,9 +15,9 @@ examples:
   splashbench scene export SCENE OUT --format colmap                SpacetimeGaussians: a model per timestep
   splashbench scene export SCENE OUT --format blender --blank-test-images      4D-Scaffold-GS
 
-Only training views have pixels, unless --with-test-images asks for the ground truth of the test views too. A code that
-is to be scored must not see it: official codes compute their own test figures from it, and some choose by them. Test
-views are in the export as poses and times (test_views.json). docs/external_methods.md has the rest.
+Only training views have pixels. --with-test-images writes those of the test views too: the ground truth. A code that is
+to be scored must not see it: official codes compute test figures from it, and some select a model by them. The export
+has the poses and times of the test views in test_views.json. docs/external_methods.md describes the formats.
 """
 
 

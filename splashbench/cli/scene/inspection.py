@@ -1,4 +1,4 @@
-"""`splashbench scene check` and `splashbench scene info`: what is wrong with a scene, and what is known of it."""
+"""`splashbench scene check` and `splashbench scene info`: list a scene's faults, print what is known of it."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from splashbench.container.scene_placement import ScenePlacement
     from splashbench.scene.layout import SceneMeta
 
-# Beyond these, what scene.json said and what the container says of gravity and scale are told apart.
+# A note is printed where gravity or scale in scene.json differs from the container's by more.
 _TILT_DEGREES, _SCALE = 3.0, 1.05
 
 _EPILOG = """\
@@ -77,15 +77,15 @@ def place_container(arguments: argparse.Namespace) -> int:
     require_container_place(scene, arguments.mesh, arguments.replace)
     require_picture(arguments.picture)
     mesh = read_mesh(arguments.mesh)
-    masked = None if arguments.masks is None else Scene.open(arguments.masks)
+    mask_scene = None if arguments.masks is None else Scene.open(arguments.masks)
     say("placing the mesh by its masks")
-    found = place_in_scene(scene, mesh, masked, arguments.up, arguments.metres_per_unit)
-    drawn = None if arguments.picture is None else picture(scene, mesh, found.placement.pose)
-    meta = write_placement(scene, arguments.mesh, found, arguments.transparent, arguments.replace)
-    if drawn is not None:
-        write_png(arguments.picture, drawn)
-    placement = found.placement
-    doubted = doubtful(found.projections)
+    outcome = place_in_scene(scene, mesh, mask_scene, arguments.up, arguments.metres_per_unit)
+    drawing = None if arguments.picture is None else picture(scene, mesh, outcome.placement.pose)
+    meta = write_placement(scene, arguments.mesh, outcome, arguments.transparent, arguments.replace)
+    if drawing is not None:
+        write_png(arguments.picture, drawing)
+    placement = outcome.placement
+    doubtful_cameras = doubtful(outcome.projections)
     if arguments.json:
         emit(
             {
@@ -93,39 +93,41 @@ def place_container(arguments: argparse.Namespace) -> int:
                 "pose": placement.pose.tolist(),
                 "gravity": meta.gravity,
                 "metres_per_unit": meta.metres_per_unit,
-                "found_gravity": found.gravity,
-                "found_metres_per_unit": found.metres_per_unit,
+                "found_gravity": outcome.gravity,
+                "found_metres_per_unit": outcome.metres_per_unit,
                 "up_axis": placement.up_axis,
                 "up_is_ambiguous": placement.up_is_ambiguous,
                 "turn": placement.turn,
-                "overlap": {name: projection.iou for name, projection in found.projections.items()},
-                "doubtful": doubted,
+                "overlap": {name: projection.iou for name, projection in outcome.projections.items()},
+                "doubtful": doubtful_cameras,
             }
         )
-    for name, projection in found.projections.items():
+    for name, projection in outcome.projections.items():
         distance = projection.contour_median_px
         off = "" if distance is None else f", outlines {distance:.2f} px apart"
         held_out = "" if name in scene.train else " (held out)"
         say(f"camera {name}{held_out}: mesh and mask overlap {projection.iou:.3f}{off}")
-    _say_what_is_doubtful(found, doubted, meta)
+    _say_what_is_doubtful(outcome, doubtful_cameras, meta)
     say(f"wrote {scene.directory / 'scene.json'}: a scene unit is {meta.metres_per_unit:.4g} m; run methods again")
     return 0
 
 
-def _say_what_is_doubtful(found: ScenePlacement, doubted: list[str], meta: SceneMeta) -> None:
-    placement = found.placement
-    if doubted:
-        say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")
+def _say_what_is_doubtful(outcome: ScenePlacement, doubtful_cameras: list[str], meta: SceneMeta) -> None:
+    placement = outcome.placement
+    if doubtful_cameras:
+        say(f"note: little overlap in camera {', '.join(doubtful_cameras)}; check it in --picture")
     if placement.up_is_ambiguous:
-        say(f"note: the mesh fits with other directions up as well; {placement.up_axis} was taken, see --up")
+        say(f"note: the mesh fits with other directions up as well; {placement.up_axis} was chosen, see --up")
     if placement.turn != "determined":
-        looks = "however it is turned" if placement.turn == "free" else f"at {placement.equivalent_turns} turns"
-        say(f"note: the container looks the same {looks}; one was taken")
-    angle = math.degrees(math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(meta.gravity or (), found.gravity))))))
+        looks = "at every turn" if placement.turn == "free" else f"at {placement.equivalent_turns} turns"
+        say(f"note: the container looks the same {looks}; one was chosen")
+    angle = math.degrees(
+        math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(meta.gravity or (), outcome.gravity)))))
+    )
     if angle > _TILT_DEGREES:
         say(f"note: scene.json's gravity stays, {angle:.0f} degrees from the container's; --replace replaces it")
-    if not 1 / _SCALE < (meta.metres_per_unit or 0) / found.metres_per_unit < _SCALE:
+    if not 1 / _SCALE < (meta.metres_per_unit or 0) / outcome.metres_per_unit < _SCALE:
         say(
             f"note: scene.json's metres_per_unit stays, {meta.metres_per_unit:.4g}; by the mesh it is"
-            f" {found.metres_per_unit:.4g}, see --metres-per-unit; --replace replaces it"
+            f" {outcome.metres_per_unit:.4g}, see --metres-per-unit; --replace replaces it"
         )

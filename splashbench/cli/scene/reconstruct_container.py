@@ -58,30 +58,30 @@ def reconstruct_container(arguments: argparse.Namespace) -> int:
         )
     require_place(scene, arguments.replace)
     require_picture(arguments.picture)
-    masked = None if arguments.masks is None else Scene.open(arguments.masks)
+    mask_scene = None if arguments.masks is None else Scene.open(arguments.masks)
     say(f"reconstructing the container from {len(scene.train)} training views")
-    found = container_from_footage(scene, masked)
-    drawn = None if arguments.picture is None else picture(scene, found)
-    path = write_reconstruction(scene, found, arguments.replace)
-    if drawn is not None:
-        write_png(arguments.picture, drawn)
-    doubted = doubtful(found.projections)
+    reconstruction = container_from_footage(scene, mask_scene)
+    drawing = None if arguments.picture is None else picture(scene, reconstruction)
+    path = write_reconstruction(scene, reconstruction, arguments.replace)
+    if drawing is not None:
+        write_png(arguments.picture, drawing)
+    doubtful_cameras = doubtful(reconstruction.projections)
     if arguments.json:
         emit(
             {
                 "scene": str(scene.directory),
                 "mesh": str(path),
-                "faces": len(found.mesh.faces),
-                "overlap": {name: projection.iou for name, projection in found.projections.items()},
-                "doubtful": doubted,
+                "faces": len(reconstruction.mesh.faces),
+                "overlap": {name: projection.iou for name, projection in reconstruction.projections.items()},
+                "doubtful": doubtful_cameras,
             }
         )
-    for name, projection in found.projections.items():
+    for name, projection in reconstruction.projections.items():
         held_out = "" if name in scene.train else " (held out)"
         say(f"camera {name}{held_out}: surface and mask overlap {projection.iou:.3f}")
-    if doubted:
-        say(f"note: little overlap in camera {', '.join(doubted)}; look at --picture before you trust it")
+    if doubtful_cameras:
+        say(f"note: little overlap in camera {', '.join(doubtful_cameras)}; check it in --picture")
     if scene.container_transparent is None:
-        say("note: it was taken to be opaque; a container that is seen through needs a scan")
-    say(f"wrote {path}, {len(found.mesh.faces)} triangles, and scene.json; run methods again")
+        say("note: the container was assumed to be opaque; a transparent one needs a scan")
+    say(f"wrote {path}, {len(reconstruction.mesh.faces)} triangles, and scene.json; run methods again")
     return 0

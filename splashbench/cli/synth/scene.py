@@ -12,8 +12,8 @@ from splashbench.errors import SplashbenchError
 
 _EPILOG = """\
 examples:
-  splashbench synth scene balls scenes/balls                 a second; balls in free flight, to try a method on
-  splashbench synth scene opaque_bowl scenes/opaque_bowl     minutes; a simulated pour
+  splashbench synth scene balls scenes/balls                 takes a second: to try a method on
+  splashbench synth scene opaque_bowl scenes/opaque_bowl     takes minutes: a simulated pour
   splashbench synth scene glass_tank scenes/tank --step 33 --timesteps 20
 
 scenes, and the time between their frames:
@@ -41,7 +41,9 @@ def register(actions: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("name", choices=_SCENES, metavar="NAME", help=f"one of {', '.join(_SCENES)}")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder to be made")
-    parser.add_argument("--size", type=image_size, metavar="WxH", help="of frames (default: 480x320; balls: 96x64)")
+    parser.add_argument(
+        "--size", type=image_size, metavar="WxH", help="size of the frames (default: 480x320; balls: 96x64)"
+    )
     parser.add_argument(
         "--timesteps", type=whole_number(1), metavar="N", help="frames per camera (default: 50; balls: 8)"
     )
@@ -49,10 +51,13 @@ def register(actions: argparse._SubParsersAction) -> None:
         "--step",
         type=positive_number("milliseconds"),
         metavar="MS",
-        help="between frames, all alike (default: as fits the scene)",
+        help="time between frames, the same for all (default: depends on the scene)",
     )
     parser.add_argument(
-        "--particle-radius", type=float, metavar="METRES", help="of the simulation (default: as fits the scene)"
+        "--particle-radius",
+        type=float,
+        metavar="METRES",
+        help="radius of the simulated particles (default: depends on the scene)",
     )
     add_seed(parser, "decides poses, lenses and noise")
     add_replace(parser)

@@ -14,8 +14,8 @@ examples:
   splashbench synth session sessions/synthetic
   splashbench synth session sessions/small --size 320x180 --fps 30 --particle-radius 0.004 --seed 7
 
-Needs the extra `splashbench[synth]` and the Debian packages libgl1 and libx11-6. The default takes two to three minutes
-on two cores. The same seed always gives the same truth.
+Needs the extra `splashbench[synth]` and the Debian packages libgl1 and libx11-6. The default session takes two to three
+minutes on two cores. The same seed always gives the same truth.
 """
 
 
@@ -31,18 +31,22 @@ def register(actions: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder to be made")
     parser.add_argument(
-        "--size", type=image_size, default=(480, 270), metavar="WxH", help="of frames (default: 480x270)"
+        "--size", type=image_size, default=(480, 270), metavar="WxH", help="size of the frames (default: 480x270)"
     )
     parser.add_argument("--fps", type=int, default=60, help="frames per second of the cameras (default: 60)")
     add_seed(parser, "decides lenses, poses, clocks and sounds")
     parser.add_argument(
-        "--duration", type=float, default=2.0, metavar="SECONDS", help="of the liquid's motion (default: 2.0)"
+        "--duration", type=float, default=2.0, metavar="SECONDS", help="length of the liquid's motion (default: 2.0)"
     )
     parser.add_argument(
-        "--particle-radius", type=float, default=0.003, metavar="METRES", help="of the simulation (default: 0.003)"
+        "--particle-radius",
+        type=float,
+        default=0.003,
+        metavar="METRES",
+        help="radius of the simulated particles (default: 0.003)",
     )
     parser.add_argument(
-        "--workers", type=whole_number(1), metavar="N", help="processes that render (default: one per core)"
+        "--workers", type=whole_number(1), metavar="N", help="number of processes that render (default: one per core)"
     )
     add_replace(parser)
 
