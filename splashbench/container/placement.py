@@ -31,7 +31,7 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
 
-class _Level(NamedTuple):
+class _FitLevel(NamedTuple):
     """How fine a fit is.
 
     extent: longer side of a mask in pixels, at most. margin: about it, as a share of it. reach: of the pairing, as such
@@ -44,9 +44,9 @@ class _Level(NamedTuple):
     steps: int
 
 
-_COARSE = _Level(96.0, 0.6, 0.5, 12)
-_MEDIUM = _Level(300.0, 0.25, 0.15, 12)
-_FINE = _Level(1000.0, 0.08, 0.04, 12)
+_COARSE = _FitLevel(96.0, 0.6, 0.5, 12)
+_MEDIUM = _FitLevel(300.0, 0.25, 0.15, 12)
+_FINE = _FitLevel(1000.0, 0.08, 0.04, 12)
 # Cells over the mesh's longest side until the fine fit, for which alone a scan is drawn whole. Fewer than so many faces
 # are always drawn.
 _SEARCH_CELLS, _COARSE_CELLS, _MEDIUM_CELLS = 40, 64, 96
@@ -201,7 +201,7 @@ def _fit(
     mesh: ContainerMesh,
     cameras: Sequence[Camera],
     masks: Mapping[str, NDArray[np.bool_]],
-    level: _Level,
+    level: _FitLevel,
     stance: Stance,
     free: Sequence[int],
     axis: Floats | None = None,

@@ -51,7 +51,7 @@ _LEAST_PIECE = 0.02
 _LEAST_COVER = 0.6
 _REMEDY = (
     "check masks and poses; a container without texture, or one that is seen through, takes a scan (`splashbench scene"
-    " place`)"
+    " place-container`)"
 )
 # Files are told apart by what they hold, so that scene.json, and with it the scene's digest, changes with the mesh.
 _FILE = "container_from_footage_{}.ply"

@@ -20,7 +20,7 @@ from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
 from splashbench.synth.imaging.geometry import Mesh, bowl_mesh, tank_mesh
 from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom
-from splashbench.synth.imaging.room import Room, pour_room, tank_room
+from splashbench.synth.imaging.room import CaptureRoom, pour_room, tank_room
 from splashbench.synth.liquid import simulation
 from splashbench.synth.liquid.simulation import Pour
 from splashbench.synth.liquid.surface import liquid_surface
@@ -41,7 +41,7 @@ class SynthContainer:
     """What the liquid is poured into: its closed mesh, the room it stands in (given the seed), and if it is clear."""
 
     mesh: Callable[[], Mesh]
-    room: Callable[[int], Room]
+    room: Callable[[int], CaptureRoom]
     transparent: bool
 
 

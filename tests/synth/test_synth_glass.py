@@ -24,11 +24,11 @@ from splashbench.synth.imaging.glass import ABSORPTION, Glass
 from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.raycast import FAR, Tracer
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom, thickness
-from splashbench.synth.imaging.room import Room, tank_room
+from splashbench.synth.imaging.room import CaptureRoom, tank_room
 
 
 @pytest.fixture(scope="module")
-def room() -> Room:
+def room() -> CaptureRoom:
     return tank_room(0)
 
 
@@ -39,12 +39,12 @@ def camera() -> LensCamera:
 
 
 @pytest.fixture(scope="module")
-def through(room: Room, camera: LensCamera) -> RoomView:
+def through(room: CaptureRoom, camera: LensCamera) -> RoomView:
     return RoomView(TracedRoom(room), camera)
 
 
 @pytest.fixture(scope="module")
-def bare(room: Room, camera: LensCamera) -> RoomView:
+def bare(room: CaptureRoom, camera: LensCamera) -> RoomView:
     return RoomView(TracedRoom(replace(room, glass=None)), camera)
 
 
@@ -122,12 +122,12 @@ def test_a_ray_that_misses_the_tank_is_left_alone() -> None:
     assert np.array_equal(panes.through(light, 0.0, FAR), light)
 
 
-def test_masks_through_the_glass_are_masks_without_it(through: RoomView, bare: RoomView, room: Room) -> None:
+def test_masks_through_the_glass_are_masks_without_it(through: RoomView, bare: RoomView, room: CaptureRoom) -> None:
     mask = through.with_liquid(LIQUID).mask
     assert mask.sum() > 200
     assert np.array_equal(mask, bare.with_liquid(LIQUID).mask)
     clay = np.full((len(tank_mesh().vertices), 3), 0.5, np.float32)
-    opaque = RoomView(TracedRoom(Room(room.quads, tank_mesh(), clay)), through.camera).with_liquid(LIQUID)
+    opaque = RoomView(TracedRoom(CaptureRoom(room.quads, tank_mesh(), clay)), through.camera).with_liquid(LIQUID)
     assert opaque.mask.sum() < 0.8 * mask.sum()
 
 

@@ -10,7 +10,7 @@ pytest.importorskip("embreex")
 from splashbench.synth.imaging.geometry import LOOK_AT, Mesh, Quad, arc_point, bowl_mesh, look_at, revolve
 from splashbench.synth.imaging.lens import LensCamera, distort, undistort
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom
-from splashbench.synth.imaging.room import Room
+from splashbench.synth.imaging.room import CaptureRoom
 
 DISTORTION = np.array([-0.13, 0.04, 5e-4, -6e-4, 0.0])
 
@@ -26,7 +26,7 @@ def room() -> TracedRoom:
     grey = np.full((8, 8, 3), 0.4, np.float32)
     table = Quad(np.array([-2.0, 0, -2]), np.array([4.0, 0, 0]), np.array([0, 0, 4.0]), grey)
     bowl = bowl_mesh()
-    return TracedRoom(Room([table], bowl, np.full((len(bowl.vertices), 3), 0.6, np.float32)))
+    return TracedRoom(CaptureRoom([table], bowl, np.full((len(bowl.vertices), 3), 0.6, np.float32)))
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ _NEIGHBOURHOOD_S = 1.5e-3  # peaks this near are the same one, with its first re
 
 
 @dataclass(frozen=True)
-class Window:
+class DelayWindow:
     """Delay measured in one window: y's time of its middle, the delay (both in seconds), peak over the next peak."""
 
     time_s: float
@@ -115,7 +115,7 @@ def measure(
     seconds: float,
     block: int = 0,
     max_windows: int = 200,
-) -> list[Window]:
+) -> list[DelayWindow]:
     """Delays in windows of `seconds` over the overlap of x and y, each within `reach` seconds of the line's prediction.
 
     `block`: samples per transform (a power of two); 0 chooses one that the reach fits into. Where windows
@@ -146,7 +146,7 @@ def measure_span(
     reach: float,
     span: tuple[float, float],
     block: int = 0,
-) -> Window | None:
+) -> DelayWindow | None:
     """Delay within one span of y's time (seconds); None where there is no sound in common to measure."""
     block = block or max(4096, 1 << int(np.ceil(np.log2(4 * reach * rate))))
     correlation = _correlate(x, y, rate, line, span, block)
@@ -158,7 +158,7 @@ def measure_span(
     at = int(np.argmax(window))
     middle = (span[0] + span[1]) / 2
     lag = (at - half + _vertex(window, at)) / fine_rate
-    return Window(float(middle), float(line[0] + (line[1] - 1) * middle + lag), _prominence(window, at, fine_rate))
+    return DelayWindow(float(middle), float(line[0] + (line[1] - 1) * middle + lag), _prominence(window, at, fine_rate))
 
 
 def peak_ratio(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> float:

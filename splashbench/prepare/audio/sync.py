@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio import delay
-from splashbench.prepare.audio.delay import Samples, Window
+from splashbench.prepare.audio.delay import DelayWindow, Samples
 
 Floats = NDArray[np.float64]
 Status = Literal["ok", "silent", "clipped", "unrelated"]
@@ -185,14 +185,14 @@ def _window_seconds(overlap: float) -> float:
     return float(np.clip(overlap / 8, 0.5, 4.0))
 
 
-def _inliers(windows: Sequence[Window], line: tuple[float, float]) -> tuple[list[Window], Floats]:
+def _inliers(windows: Sequence[DelayWindow], line: tuple[float, float]) -> tuple[list[DelayWindow], Floats]:
     residuals = np.array([w.delay_s - line[0] - (line[1] - 1) * w.time_s for w in windows])
     near = np.abs(residuals) <= _TOLERANCE_S
     return [w for w, ok in zip(windows, near) if ok], residuals[near]
 
 
 def _consensus(
-    windows: Sequence[Window], lag: float, rate_prior_sd: float, clock_rate: float = 1.0
+    windows: Sequence[DelayWindow], lag: float, rate_prior_sd: float, clock_rate: float = 1.0
 ) -> tuple[float, tuple[float, float] | None]:
     """The line that most windows support, by weight of their peaks: (support, (start, rate)); line None without any.
 

@@ -42,7 +42,7 @@ MIN_AREA_PX = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Background:
+class EmptyScene:
     """The empty scene of one camera. `median`: [H, W, 3] grey levels; `noise`: [H, W] standard deviation of a
     channel."""
 
@@ -50,7 +50,7 @@ class Background:
     noise: Floats
 
     @classmethod
-    def fit(cls, frames: Sequence[NDArray[np.uint8]]) -> Background:
+    def fit(cls, frames: Sequence[NDArray[np.uint8]]) -> EmptyScene:
         """From frames [H, W, 3] without liquid."""
         stack = np.stack(frames)
         median = np.median(stack, axis=0).astype(np.float32)
@@ -89,7 +89,7 @@ class Background:
 
 
 def segment(distance: Floats, difference: Floats) -> Mask:
-    """Liquid mask [H, W] from `Background.compare`: hysteresis, a trimmed outline, clean-up."""
+    """Liquid mask [H, W] from `EmptyScene.compare`: hysteresis, a trimmed outline, clean-up."""
     low = distance > LOW
     count, labels = cv2.connectedComponents(low.astype(np.uint8), connectivity=8)
     seeded = np.zeros(count, bool)
@@ -156,7 +156,7 @@ class BackgroundMasks:
                 f" {MIN_BACKGROUND_FRAMES} are needed to learn the background;"
                 " give masks in a folder, or start recording earlier"
             )
-        background = Background.fit([frame for _, frame in self._read_frames(camera, quiet)])
+        background = EmptyScene.fit([frame for _, frame in self._read_frames(camera, quiet)])
         for index, frame in self._read_frames(camera, indices):
             yield index, segment(*background.compare(frame))
 

@@ -95,7 +95,7 @@ def camera_motion(recording: Recording) -> tuple[tuple[float, float] | None, lis
     """One camera's motion in local seconds, None where nothing moves, and remarks worth reporting."""
     times = recording.frame_times
     static = [image for _, image in recording.luma(WIDTH, 0, int(np.searchsorted(times, STATIC_SECONDS)))]
-    background = _Background(static)
+    background = _StaticBeginning(static)
     first, last = 0, len(times) - 1
     notes = []
     if times[-1] > _LONG_RECORDING_S:
@@ -124,7 +124,7 @@ def camera_motion(recording: Recording) -> tuple[tuple[float, float] | None, lis
     return (start, end), notes
 
 
-class _Background:
+class _StaticBeginning:
     """The static beginning: median image [h, w] and, per pixel, the step that noise does not make."""
 
     def __init__(self, images: list[Image]) -> None:
@@ -149,7 +149,7 @@ class _Background:
 
 
 def _activity(
-    frames: Iterable[tuple[int, Image]], background: _Background, times: Floats, lag_s: float = _LAG_S
+    frames: Iterable[tuple[int, Image]], background: _StaticBeginning, times: Floats, lag_s: float = _LAG_S
 ) -> tuple[NDArray[np.int64], Floats, Floats]:
     """Per frame: its index, pixels departed from the background, pixels changed against the frame `lag_s` earlier."""
     indices: list[int] = []
@@ -187,7 +187,7 @@ def _bursts(times: Floats, active: NDArray[np.bool_]) -> list[tuple[float, float
     return joined
 
 
-def _narrow(recording: Recording, background: _Background, times: Floats) -> tuple[int, int]:
+def _narrow(recording: Recording, background: _StaticBeginning, times: Floats) -> tuple[int, int]:
     """(first, last) frame around the largest motion among key frames; everything where these are too rare."""
     indices, _, changed = _activity(recording.luma(WIDTH, keyframes=True), background, times, lag_s=1e-6)
     gaps = np.diff(times[indices])

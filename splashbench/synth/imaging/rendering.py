@@ -18,7 +18,7 @@ from splashbench.synth.imaging.geometry import Mesh
 from splashbench.synth.imaging.glass import Glass
 from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.raycast import FAR, Hits, Tracer
-from splashbench.synth.imaging.room import Room
+from splashbench.synth.imaging.room import CaptureRoom
 from splashbench.synth.imaging.texture import sample, to_srgb
 
 Vectors = NDArray[np.float32]
@@ -43,7 +43,7 @@ class LiquidFrame:
 class TracedRoom:
     """A room that rays can be cast into."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: CaptureRoom) -> None:
         self.room = room
         meshes = [quad.mesh() for quad in room.quads]
         if room.bowl is not None:

@@ -26,7 +26,7 @@ BOWL_COLOR = (0.66, 0.42, 0.24)
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class CaptureRoom:
     """What does not move: rectangles, and the bowl with its albedo per vertex [V, 3] (None where cleared away).
 
     `glass` is a clear container in the bowl's place; `clear_liquid` says that the liquid lets light through.
@@ -57,7 +57,7 @@ def bare_quads(seed: int) -> tuple[Quad, ...]:
     return tuple(quads)
 
 
-def pour_room(seed: int) -> Room:
+def pour_room(seed: int) -> CaptureRoom:
     """The room of the recording: the bowl on the table."""
     bowl = bowl_mesh()
     rng = np.random.default_rng([seed, 2])
@@ -65,15 +65,15 @@ def pour_room(seed: int) -> Room:
     shade = 0.86 + 0.14 * np.clip(bowl.vertices[:, 1:2] / 0.08, 0, 1)
     speckle = 1 + 0.03 * rng.standard_normal((len(bowl.vertices), 1))
     albedo = np.array(BOWL_COLOR) * shade * speckle
-    return Room(list(bare_quads(seed)), bowl, albedo.astype(np.float32))
+    return CaptureRoom(list(bare_quads(seed)), bowl, albedo.astype(np.float32))
 
 
-def tank_room(seed: int) -> Room:
+def tank_room(seed: int) -> CaptureRoom:
     """The same room with the glass tank on the table, for a liquid that is clear too."""
-    return Room(list(bare_quads(seed)), None, None, glass=tank_mesh(), clear_liquid=True)
+    return CaptureRoom(list(bare_quads(seed)), None, None, glass=tank_mesh(), clear_liquid=True)
 
 
-def static_room(seed: int, board: dict[str, Any]) -> Room:
+def static_room(seed: int, board: dict[str, Any]) -> CaptureRoom:
     """The room of the static recordings: no bowl, printed clutter all around, the board lying near the middle."""
     rng = np.random.default_rng([seed, 3])
     quads = list(bare_quads(seed))
@@ -89,7 +89,7 @@ def static_room(seed: int, board: dict[str, Any]) -> Room:
         quads += box_quads(centre, size, float(rng.uniform(0, 90)), textures)
     pose = board_pose(board)
     quads.append(board_quad(board, pose))
-    return Room(quads, None, None)
+    return CaptureRoom(quads, None, None)
 
 
 def board_pose(board: dict[str, Any]) -> Array:

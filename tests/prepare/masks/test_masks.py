@@ -14,7 +14,7 @@ from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.undistort import Undistorter
 from splashbench.prepare.container import container_masks
 from splashbench.prepare.crop import PixelBox
-from splashbench.prepare.masks.background import Background, BackgroundMasks, segment
+from splashbench.prepare.masks.background import BackgroundMasks, EmptyScene, segment
 from splashbench.prepare.masks.provider import FolderMasks, mask_health
 
 WIDTH, HEIGHT = 240, 160
@@ -47,7 +47,7 @@ def intersection_over_union(a: np.ndarray, b: np.ndarray) -> float:
 def test_liquid_of_any_colour_is_found_despite_noise_shadow_and_exposure(liquid: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(1)
     empty = scenery(rng)
-    background = Background.fit([recorded(empty, rng) for _ in range(15)])
+    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
     lit = empty * (1 - 0.4 * cv2.GaussianBlur(blob(22, 175, 60), (0, 0), 4))[..., None]  # a shadow, 40% darker
     coverage = blob(25, 90, 90)
     coverage = np.maximum(coverage, blob(3, 60, 30))  # a droplet
@@ -60,7 +60,7 @@ def test_liquid_of_any_colour_is_found_despite_noise_shadow_and_exposure(liquid:
 def test_an_empty_frame_has_an_empty_mask() -> None:
     rng = np.random.default_rng(2)
     empty = scenery(rng)
-    background = Background.fit([recorded(empty, rng) for _ in range(15)])
+    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
     for _ in range(5):
         assert not segment(*background.compare(recorded(empty, rng))).any()
 
@@ -68,7 +68,7 @@ def test_an_empty_frame_has_an_empty_mask() -> None:
 def test_a_thin_stream_keeps_its_width() -> None:
     rng = np.random.default_rng(3)
     empty = scenery(rng)
-    background = Background.fit([recorded(empty, rng) for _ in range(15)])
+    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
     columns = np.arange(WIDTH) + 0.5
     coverage = np.clip(3.0 - np.abs(columns - 120.0) + 0.5, 0, 1)[None].repeat(HEIGHT, 0)  # six pixels wide
     soft = cv2.GaussianBlur(coverage, (0, 0), 0.8)[..., None]  # the lens and the codec blur it
