@@ -7,6 +7,7 @@ from splashbench.harness.runner import run_method
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.leaderboard import write_leaderboard
 from splashbench.report.results import load_results
+from splashbench.report.table import leaderboard_table
 from splashbench.scene import Scene
 from splashbench.score import score_submission, shared_fields
 from splashbench.synth.balls import write_balls_scene
@@ -37,7 +38,8 @@ def main(out: Path, methods: tuple[str, ...] = METHODS) -> list[Path]:
 
     sources = load_results(out / "leaderboard_results")
     (out / "leaderboard").mkdir(exist_ok=True)
-    files = write_leaderboard(sources, out / "leaderboard") + speed_accuracy_chart(sources, out / "leaderboard")
+    files = write_leaderboard(leaderboard_table(sources), sources, out / "leaderboard")
+    files += speed_accuracy_chart(sources, out / "leaderboard")
     print("wrote", *files)
     return files
 
