@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import render as maker  # benchmarks/render.py, beside this file
+import render_scenes  # beside this file
 import torch
 
 from splashbench.files import write_json
@@ -136,7 +136,7 @@ def main() -> int:
     if reason is not None:
         print(f"error: nothing was measured: {reason}", file=sys.stderr)
         return 1
-    reference = maker.reference()
+    reference = render_scenes.reference()
     results: dict[str, Any] = {
         "gpu": torch.cuda.get_device_name(),
         "versions": {"gsplat": cuda.GSPLAT_VERSION, "torch": torch.__version__, "cuda": torch.version.cuda},
@@ -146,8 +146,8 @@ def main() -> int:
         "repeats": options.repeats,
         "tests": run_tests(),
         "scenes": {
-            name: measure(maker.make_scene(*size), maker.BACKGROUND, options.repeats, reference)
-            for name, size in maker.SCENES.items()
+            name: measure(render_scenes.make_scene(*size), render_scenes.BACKGROUND, options.repeats, reference)
+            for name, size in render_scenes.SCENES.items()
         },
     }
     print_table(results)

@@ -41,7 +41,7 @@ DEVICE = "cuda"
 """Where tensors go that are not on a CUDA device yet."""
 
 
-class Gaussians(NamedTuple):
+class DeviceGaussians(NamedTuple):
     """float32 on the device. colors: [N, C], or [cameras, N, C], or None for opacity alone."""
 
     means: Tensor
@@ -50,7 +50,7 @@ class Gaussians(NamedTuple):
     colors: Tensor | None
 
 
-class View(NamedTuple):
+class CameraArguments(NamedTuple):
     """One camera's rendering, its arguments checked."""
 
     camera: Camera
@@ -122,7 +122,7 @@ def rasterize(
     for i, options in enumerate(views):
         own = colors[i] if colors is not None and per_view else colors
         checked.append(_check_view(means, factors, opacities, own, options, device))
-    given = Gaussians(
+    given = DeviceGaussians(
         means.to(device, torch.float32),
         factors.to(device, torch.float32),
         opacities.to(device, torch.float32),
@@ -156,7 +156,7 @@ def _check_view(
     colors: Tensor | None,
     options: dict[str, Any],
     device: torch.device,
-) -> View:
+) -> CameraArguments:
     camera, frozen = arguments.check_camera(options["camera"]), options.get("frozen")
     depth, compact = bool(options.get("depth")), bool(options.get("compact"))
     channels = arguments.check_shapes(means, factors, opacities, colors)
@@ -164,7 +164,7 @@ def _check_view(
     background = _background(options.get("background"), camera, channels, device)
     modes = options.get("modes")
     modes = arguments.check_modes(modes.cpu() if isinstance(modes, Tensor) else modes, camera)
-    return View(camera, background, modes, frozen, depth, compact)
+    return CameraArguments(camera, background, modes, frozen, depth, compact)
 
 
 def _background(background: Any, camera: Camera, channels: int, device: torch.device) -> Tensor | None:
@@ -180,7 +180,7 @@ def _background(background: Any, camera: Camera, channels: int, device: torch.de
     return torch.tensor(arguments.check_background(background, camera, channels), device=device)
 
 
-def _check_finite(gaussians: Gaussians) -> None:
+def _check_finite(gaussians: DeviceGaussians) -> None:
     """Raise ValueError as on the CPU where an entry is not finite; waits for the device once."""
     finite = torch.stack([torch.isfinite(tensor).all() for tensor in gaussians if tensor is not None])
     if bool(finite.all()):
@@ -191,7 +191,7 @@ def _check_finite(gaussians: Gaussians) -> None:
         arguments.check_finite(means, factors, opacities, own)
 
 
-def _batches(views: Sequence[View]) -> list[list[int]]:
+def _batches(views: Sequence[CameraArguments]) -> list[list[int]]:
     """The views' indices, together where one call of gsplat can render them: same size, same Gaussians."""
     batches: dict[tuple, list[int]] = {}
     for i, view in enumerate(views):
@@ -199,10 +199,10 @@ def _batches(views: Sequence[View]) -> list[list[int]]:
     return list(batches.values())
 
 
-_frozen_on_device: dict[tuple[int, torch.device], Gaussians] = {}
+_frozen_on_device: dict[tuple[int, torch.device], DeviceGaussians] = {}
 
 
-def _with_frozen(gaussians: Gaussians, frozen: Frozen | None, device: torch.device) -> Gaussians:
+def _with_frozen(gaussians: DeviceGaussians, frozen: Frozen | None, device: torch.device) -> DeviceGaussians:
     """The Gaussians, then the frozen ones: gsplat's sort is stable, so this is the order at equal depth."""
     if frozen is None:
         return gaussians
@@ -211,18 +211,18 @@ def _with_frozen(gaussians: Gaussians, frozen: Frozen | None, device: torch.devi
         means, factors, opacities = (torch.tensor(array, device=device) for array in frozen.gaussians[:3])
         channels = frozen.gaussians[3]
         colors = None if channels is None else torch.tensor(channels, device=device)
-        _frozen_on_device[key] = Gaussians(means, factors, opacities, colors)
+        _frozen_on_device[key] = DeviceGaussians(means, factors, opacities, colors)
         weakref.finalize(frozen, _frozen_on_device.pop, key, None)
     behind = _frozen_on_device[key]
     means, factors, opacities = (torch.cat(pair) for pair in zip(gaussians[:3], behind[:3]))
     colors = gaussians.colors
     if colors is not None and behind.colors is not None:
         colors = torch.cat([colors, behind.colors.expand(*colors.shape[:-2], -1, -1)], dim=-2)
-    return Gaussians(means, factors, opacities, colors)
+    return DeviceGaussians(means, factors, opacities, colors)
 
 
 def _render(
-    gsplat: ModuleType, gaussians: Gaussians, views: Sequence[View], device: torch.device
+    gsplat: ModuleType, gaussians: DeviceGaussians, views: Sequence[CameraArguments], device: torch.device
 ) -> list[tuple[Tensor, Tensor]]:
     """Images (color [H, W, C or C + 1], opacity [H, W]) of views of one size and one set of Gaussians."""
     means, factors, opacities, colors = gaussians
@@ -272,7 +272,7 @@ def _render(
     ]  # fmt: skip
 
 
-def _flat_backgrounds(views: Sequence[View], channels: int, device: torch.device) -> Tensor | None:
+def _flat_backgrounds(views: Sequence[CameraArguments], channels: int, device: torch.device) -> Tensor | None:
     """[views, channels]: backgrounds of one color, which gsplat composites; 0 for those that are images."""
     flat = [view.background if view.background is not None and view.background.ndim == 1 else None for view in views]
     if all(background is None for background in flat):
@@ -282,7 +282,7 @@ def _flat_backgrounds(views: Sequence[View], channels: int, device: torch.device
 
 
 def _image(
-    view: View, channels: int, color: Tensor | None, opacity: Tensor | None, device: torch.device
+    view: CameraArguments, channels: int, color: Tensor | None, opacity: Tensor | None, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """One view's color and opacity, its background image and modes applied. None: not rendered for any tile."""
     behind = torch.zeros(channels, device=device) if view.background is None else view.background
@@ -303,7 +303,7 @@ def _image(
     return color, opacity
 
 
-def _tiles(image: Tensor, view: View) -> Tensor:
+def _tiles(image: Tensor, view: CameraArguments) -> Tensor:
     """The compact layout (see tiles.to_tiles) of an image [H, W, C]: [K, C, TILE_HEIGHT, TILE_WIDTH]."""
     rows, columns = tile_grid(view.camera.width, view.camera.height)
     beyond = (0, 0, 0, columns * TILE_WIDTH - view.camera.width, 0, rows * TILE_HEIGHT - view.camera.height)

@@ -19,7 +19,7 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
-from ..kernel.window_loss import Photograph
+from ..kernel.window_loss import WindowPhotograph
 
 MASK_MARGIN = 8
 # A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
@@ -40,7 +40,7 @@ class TrainingTarget:
     fraction: float
     camera: Camera
     eye: Tensor
-    photograph: Photograph
+    photograph: WindowPhotograph
     background: Tensor
     area: float
     hidden: Tensor | None = None
@@ -117,7 +117,7 @@ def collect_targets(
             box = _extent(mask, MASK_MARGIN)
             x0, y0, x1, y1 = _window(camera, box, positions)
             part = slice(box[1], box[3]), slice(box[0], box[2])
-            photograph = Photograph(
+            photograph = WindowPhotograph(
                 torch.from_numpy(scene.image(name, t)[part].copy()),
                 torch.from_numpy(mask[part].copy()),
                 top=box[1] - y0,

@@ -26,7 +26,7 @@ from .library import KERNEL, WindowStruct
 
 
 @dataclass(frozen=True)
-class Photograph:
+class WindowPhotograph:
     """What a camera saw of a box within the window, where alone there is liquid.
 
     image: uint8 [rows, columns, 3]; mask: bool [rows, columns]; both contiguous, on the CPU. top, left: of the box.
@@ -44,7 +44,7 @@ class Photograph:
         return slice(self.top, self.top + rows), slice(self.left, self.left + columns)
 
 
-def window_losses(image: Tensor, alpha: Tensor, photograph: Photograph) -> tuple[Tensor, Tensor, Tensor]:
+def window_losses(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:
     """(foreground, gradient, silhouette), scalars; differentiable by `image`, float32 [h, w, 3], and `alpha` [h, w].
 
     Raises TypeError or ValueError where these do not fit together.
@@ -66,7 +66,7 @@ def window_losses(image: Tensor, alpha: Tensor, photograph: Photograph) -> tuple
     return losses[0], losses[1], losses[2]
 
 
-def _run(function: Any, photograph: Photograph, image: Tensor, alpha: Tensor, *rest: Any) -> None:
+def _run(function: Any, photograph: WindowPhotograph, image: Tensor, alpha: Tensor, *rest: Any) -> None:
     (rows, columns), (height, width) = photograph.mask.shape, alpha.shape
     truth, mask = photograph.image.data_ptr(), photograph.mask.data_ptr()
     window = WindowStruct(width, height, photograph.left, photograph.top, columns, rows, truth, mask)
@@ -77,7 +77,7 @@ def _run(function: Any, photograph: Photograph, image: Tensor, alpha: Tensor, *r
 
 class _WindowLosses(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, alpha: Tensor, photograph: Photograph) -> Tensor:
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> Tensor:
         image, alpha = image.contiguous(), alpha.contiguous()
         losses = (ctypes.c_double * 3)()
         _run(KERNEL.library.splash_window_losses, photograph, image, alpha, losses)

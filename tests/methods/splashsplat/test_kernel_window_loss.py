@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from splashbench.native.threads import use_threads
 from splashbench_methods.splashsplat.appearance import losses
-from splashbench_methods.splashsplat.kernel.window_loss import Photograph, window_losses
+from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph, window_losses
 
-Case = tuple[torch.Tensor, torch.Tensor, Photograph]
+Case = tuple[torch.Tensor, torch.Tensor, WindowPhotograph]
 
 
 def case(rows: int, columns: int, around: tuple[int, int, int, int] = (0, 0, 0, 0), seed: int = 0) -> Case:
@@ -22,7 +22,7 @@ def case(rows: int, columns: int, around: tuple[int, int, int, int] = (0, 0, 0, 
     truth = torch.randint(0, 256, (rows, columns, 3), dtype=torch.uint8)
     black = torch.rand(rows, columns) < 0.2
     truth[black] = 0
-    photograph = Photograph(truth, torch.rand(rows, columns) < 0.4, top, left)
+    photograph = WindowPhotograph(truth, torch.rand(rows, columns) < 0.4, top, left)
     height, width = top + rows + bottom, left + columns + right
     image = torch.rand(height, width, 3)
     image[photograph.box][black] = 0
@@ -84,10 +84,10 @@ def test_an_empty_mask_leaves_the_silhouette_alone():
 def test_what_does_not_fit_is_refused():
     image, alpha, photograph = case(8, 9)
     with pytest.raises(ValueError, match="a box of 9x8 px at 1, 0 leaves 9x8 px"):
-        window_losses(image, alpha, Photograph(photograph.image, photograph.mask, 0, 1))
+        window_losses(image, alpha, WindowPhotograph(photograph.image, photograph.mask, 0, 1))
     with pytest.raises(ValueError, match=r"an image \[8, 9, 3\] does not go with alpha \[7, 9\]"):
         window_losses(image, alpha[:7], photograph)
     with pytest.raises(TypeError, match="not float32"):
         window_losses(image.double(), alpha, photograph)
     with pytest.raises(TypeError, match="not contiguous uint8 and bool"):
-        window_losses(image, alpha, Photograph(photograph.image.float(), photograph.mask, 0, 0))
+        window_losses(image, alpha, WindowPhotograph(photograph.image.float(), photograph.mask, 0, 0))
