@@ -78,15 +78,15 @@ def _files(root: Path, folder: Path, pattern: str) -> list[Path]:
 def kernels(root: Path = ROOT) -> list[Kernel]:
     """Every kernel of the source tree. Raises KernelBuildError where there is none, or two have the same name."""
     folders = {path.parent for pattern in KERNELS for path in root.glob(f"{pattern}/*.cpp")}
-    found = [Kernel(folder.relative_to(root)) for folder in sorted(folders)]
-    if not found:
+    in_tree = [Kernel(folder.relative_to(root)) for folder in sorted(folders)]
+    if not in_tree:
         raise KernelBuildError(f"{root}: the kernels' sources are not there; get the complete source tree")
     by_name: dict[str, Kernel] = {}
-    for kernel in found:
+    for kernel in in_tree:
         other = by_name.setdefault(kernel.name, kernel)
         if other is not kernel:
             raise KernelBuildError(f"{kernel.folder} and {other.folder} make the same library; rename one's folder")
-    return found
+    return in_tree
 
 
 # --- The build -------------------------------------------------------------------------------------------------------

@@ -41,12 +41,12 @@ WARM_UP = 2
 def run_tests() -> dict[str, Any]:
     """Whether the renderer's tests marked cuda pass, and pytest's last line."""
     command = [sys.executable, "-m", "pytest", "-q", "-m", "cuda", "tests/render"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    lines = done.stdout.strip().splitlines() or [done.stderr.strip()[-300:]]
+    outcome = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    lines = outcome.stdout.strip().splitlines() or [outcome.stderr.strip()[-300:]]
     # Status 0 says that none failed; tests that were skipped are not passed.
-    passed = done.returncode == 0 and " passed" in lines[-1] and not re.search(r"\d skipped", lines[-1])
+    passed = outcome.returncode == 0 and " passed" in lines[-1] and not re.search(r"\d skipped", lines[-1])
     if not passed:
-        print(done.stdout, done.stderr, sep="\n", file=sys.stderr)
+        print(outcome.stdout, outcome.stderr, sep="\n", file=sys.stderr)
     return {"passed": passed, "summary": lines[-1]}
 
 

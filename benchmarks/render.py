@@ -114,11 +114,11 @@ class Benchmark:
             return nothing
         with tempfile.TemporaryDirectory() as folder:
             library = Path(folder) / "libprototype.so"
-            done = subprocess.run(
+            outcome = subprocess.run(
                 [*COMPILE, str(self.prototype / "rast_port.cpp"), "-o", str(library)], capture_output=True, text=True
             )
-            if done.returncode:
-                self.missing["prototype_ratio"] = f"the prototype did not compile: {done.stderr.strip()[-300:]}"
+            if outcome.returncode:
+                self.missing["prototype_ratio"] = f"the prototype did not compile: {outcome.stderr.strip()[-300:]}"
                 return nothing
             module = load_module(self.prototype / "cpp_backend.py")
             loaded = module.Lib(str(library.resolve()))

@@ -1,4 +1,4 @@
-// Memory that grows and is kept: aligned for vectors, not initialised, for plain data only.
+// A buffer that grows and never shrinks: aligned for vectors, not initialised, for plain data only.
 #pragma once
 
 #include <cstddef>

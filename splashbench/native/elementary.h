@@ -8,7 +8,7 @@ namespace splash {
 constexpr float LOG2_E = 1.4426950408889634f;
 constexpr float LN_2 = 0.6931471805599453f;
 
-// e^x, relative error below 1e-6 for |x| < 10 and below 1e-5 elsewhere; held at 2^-125 and 2^125.
+// e^x, relative error below 1e-6 for |x| < 10 and below 1e-5 elsewhere; clamped to [2^-125, 2^125].
 inline Floats exp(Floats x) {
     const Floats power = x * LOG2_E;
     // Where an operand is NaN, min and max give the second one.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 # Smaller arrays come from the heap, which keeps its memory itself.
 SMALLEST_BYTES = 1 << 20
-KEPT_BYTES = 1 << 28
+MAX_BYTES = 1 << 28
 
 _lock = threading.Lock()
 _buffers: list[NDArray[np.float32]] = []  # least recently handed out first
@@ -28,8 +28,7 @@ def _after_fork() -> None:
     _lock = threading.Lock()
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+os.register_at_fork(after_in_child=_after_fork)
 
 # What getrefcount says of an array that nothing but a list holds.
 _probe = [np.empty(1, np.float32)]
@@ -49,6 +48,6 @@ def empty(shape: tuple[int, ...]) -> NDArray[np.float32]:
                 return _buffers[-1][:count].reshape(shape)
         fresh = np.empty(count, np.float32)
         _buffers.append(fresh)
-        while len(_buffers) > 1 and sum(kept.nbytes for kept in _buffers) > KEPT_BYTES:
+        while len(_buffers) > 1 and sum(buffer.nbytes for buffer in _buffers) > MAX_BYTES:
             _buffers.pop(0)  # lives on for as long as somebody holds a view of it
         return fresh.reshape(shape)

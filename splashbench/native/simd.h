@@ -29,8 +29,8 @@ typedef float UnalignedFloats __attribute__((vector_size(LANES * 4), aligned(4),
 inline Floats load_anywhere(const float* at) { return *reinterpret_cast<const UnalignedFloats*>(at); }
 inline void store_anywhere(float* at, Floats value) { *reinterpret_cast<UnalignedFloats*>(at) = value; }
 
-// GCC makes two instructions of the comparison and the choice where the processor has one. (With a mask of all lanes, which
-// it drops again, because it says of the header's plain form that it reads what was never set.)
+// By intrinsics: GCC makes two instructions of a comparison and a choice, where the processor has one. Those of AVX-512 take
+// a mask of all lanes, which GCC drops again; it warns that the header's plain ones read what was never set.
 inline Floats min(Floats a, Floats b) {
 #if SPLASH_LANES == 16
     return (Floats)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b);

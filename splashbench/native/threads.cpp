@@ -22,8 +22,8 @@ class Pool {
   public:
     // False where the pool is busy; nothing was done then.
     bool run(int workers, void (*work)(void*, int), void* argument) {
-        std::unique_lock<std::mutex> mine(busy_, std::try_to_lock);
-        if (!mine.owns_lock()) return false;
+        std::unique_lock<std::mutex> turn(busy_, std::try_to_lock);
+        if (!turn.owns_lock()) return false;
         start_threads(workers - 1);
         uint64_t number;
         {
@@ -49,8 +49,8 @@ class Pool {
 
   private:
     // Where the system gives no more threads, those that are there do all the work.
-    void start_threads(int wanted) {
-        while (threads_ < wanted) {
+    void start_threads(int count) {
+        while (threads_ < count) {
             try {
                 std::thread(&Pool::loop, this, call_.load(std::memory_order_relaxed)).detach();
             } catch (const std::system_error&) {
@@ -110,16 +110,16 @@ class Pool {
 std::atomic<Pool*> pool{nullptr};
 
 Pool* current_pool() {
-    Pool* found = pool.load(std::memory_order_acquire);
-    if (found != nullptr) return found;
-    Pool* const made = new Pool;
-    if (pool.compare_exchange_strong(found, made)) {
+    Pool* current = pool.load(std::memory_order_acquire);
+    if (current != nullptr) return current;
+    Pool* const created = new Pool;
+    if (pool.compare_exchange_strong(current, created)) {
         static std::once_flag once;
         std::call_once(once, [] { pthread_atfork(nullptr, nullptr, [] { pool.store(nullptr); }); });
-        return made;
+        return created;
     }
-    delete made;
-    return found;
+    delete created;
+    return current;
 }
 
 }  // namespace

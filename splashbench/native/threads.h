@@ -13,8 +13,8 @@ constexpr int MAX_THREADS = 64;
 inline int workers(int threads) { return std::clamp(threads, 1, MAX_THREADS); }
 
 // Calls work(argument, worker) for every worker in [0, workers), on this thread and on others that are kept between calls,
-// and waits. One thread may do the work of several workers, one after another, and does while somebody else uses the
-// threads: work must not wait for other workers. Rethrows std::bad_alloc.
+// and waits. One thread may do the work of several workers, one after another; it does all of it while another caller uses
+// the threads. So work must not wait for other workers. Rethrows std::bad_alloc.
 void run_on_workers(int workers, void (*work)(void*, int), void* argument);
 
 template <class Work>

@@ -82,8 +82,8 @@ def rasterize_arrays(
     per_camera = _per_camera(channels, cameras, len(views))
     images: tuple[list[Floats], list[Floats]] = ([], [])
     for i, view in enumerate(views):
-        own = channels[i] if channels is not None and per_camera else channels
-        rendering = cpu.forward(arrays[0], arrays[1], arrays[2], own, **view)
+        view_colors = channels[i] if channels is not None and per_camera else channels
+        rendering = cpu.forward(arrays[0], arrays[1], arrays[2], view_colors, **view)
         images[0].append(rendering.color)
         images[1].append(rendering.opacity)
     return (images[0][0], images[1][0]) if isinstance(cameras, Camera) else images

@@ -28,14 +28,16 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         tensors = (means, factors, opacities, colors)
         per_view = colors is not None and colors.ndim == 3
-        wanted = any(t is not None and t.requires_grad for t in tensors)
+        needs_gradients = any(t is not None and t.requires_grad for t in tensors)
         arrays = [floats(t, name) for t, name in zip(tensors[:3], GAUSSIANS)]
         channels = None if colors is None else floats(colors, "colors")
         renderings = []
         for i, view in enumerate(views):
-            own = channels[i] if per_view and channels is not None else channels
-            renderings.append(cpu.forward(arrays[0], arrays[1], arrays[2], own, **view, for_backward=wanted))
-        if wanted:
+            view_colors = channels[i] if per_view and channels is not None else channels
+            renderings.append(
+                cpu.forward(arrays[0], arrays[1], arrays[2], view_colors, **view, for_backward=needs_gradients)
+            )
+        if needs_gradients:
             ctx.renderings, ctx.per_view = renderings, per_view
             # The kernel reads the inputs again; torch notices where they were changed in place since.
             ctx.save_for_backward(*[t for t in tensors if t is not None])

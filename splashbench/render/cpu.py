@@ -159,7 +159,7 @@ def freeze(means: Any, factors: Any, opacities: Any, colors: Any, camera: Camera
     arguments.check_camera(camera)
     depth = arguments.check_flag(depth, "depth")
     arrays, gaussians = _gaussians(means, factors, opacities, colors)
-    # The arrays are kept beyond this call, so later changes by the caller must not reach them.
+    # These arrays outlive this call: later changes by the caller must not reach them.
     arrays = tuple(None if a is None else a.copy() for a in arrays)  # type: ignore[assignment]
     gaussians = GaussiansStruct(len(arrays[0]), gaussians.channels, *map(_address, arrays))
     handle = _Handle(arrays)
@@ -202,9 +202,9 @@ def forward(
     color_shape = (*shape, channels)
     if compact:
         rows, columns = tile_grid(camera.width, camera.height)
-        kept = rows * columns if tile_modes is None else int(np.count_nonzero(tile_modes != SKIP))
-        shape = (kept, TILE_HEIGHT, TILE_WIDTH)
-        color_shape = (kept, channels, TILE_HEIGHT, TILE_WIDTH)
+        tile_count = rows * columns if tile_modes is None else int(np.count_nonzero(tile_modes != SKIP))
+        shape = (tile_count, TILE_HEIGHT, TILE_WIDTH)
+        color_shape = (tile_count, channels, TILE_HEIGHT, TILE_WIDTH)
     color, opacity = memory.empty(color_shape), memory.empty(shape)
     output = OutputStruct(
         int(depth),

@@ -118,25 +118,25 @@ def rasterize(
     per_view = colors is not None and colors.ndim == 3
     if colors is not None and per_view and len(colors) != len(views):
         raise ValueError(f"colors is for {len(colors)} cameras, not {len(views)}")
-    checked = []
+    requests = []
     for i, options in enumerate(views):
-        own = colors[i] if colors is not None and per_view else colors
-        checked.append(_check_view(means, factors, opacities, own, options, device))
-    given = DeviceGaussians(
+        view_colors = colors[i] if colors is not None and per_view else colors
+        requests.append(_check_view(means, factors, opacities, view_colors, options, device))
+    inputs = DeviceGaussians(
         means.to(device, torch.float32),
         factors.to(device, torch.float32),
         opacities.to(device, torch.float32),
         None if colors is None else colors.to(device, torch.float32),
     )
-    _check_finite(given)
+    _check_finite(inputs)
     # 0, computed from all inputs: one that an image does not depend on gets a gradient of 0, as on the CPU, not None.
-    anchor = torch.stack([tensor[:0].sum() for tensor in given if tensor is not None]).sum()
-    given = given._replace(opacities=given.opacities + anchor)
+    anchor = torch.stack([tensor[:0].sum() for tensor in inputs if tensor is not None]).sum()
+    inputs = inputs._replace(opacities=inputs.opacities + anchor)
 
     results: dict[int, tuple[Tensor, Tensor]] = {}
-    for batch in _batches(checked):
-        members = [checked[i] for i in batch]
-        gaussians = given._replace(colors=given.colors[batch]) if given.colors is not None and per_view else given
+    for batch in _batches(requests):
+        members = [requests[i] for i in batch]
+        gaussians = inputs._replace(colors=inputs.colors[batch]) if inputs.colors is not None and per_view else inputs
         images = _render(gsplat, _with_frozen(gaussians, members[0].frozen, device), members, device)
         for i, view, (color, opacity) in zip(batch, members, images):
             color, opacity = (image if image.requires_grad else image + anchor for image in (color, opacity))
@@ -146,7 +146,7 @@ def rasterize(
             results[i] = color.to(means.device), opacity.to(means.device)
             frozen = 0 if view.frozen is None else len(view.frozen)
             counters.record(len(means) + frozen, f"cuda (gsplat {GSPLAT_VERSION})")
-    return [results[i] for i in range(len(checked))]
+    return [results[i] for i in range(len(requests))]
 
 
 def _check_view(
@@ -187,8 +187,8 @@ def _check_finite(gaussians: DeviceGaussians) -> None:
         return
     means, factors, opacities = (tensor.detach().cpu().numpy() for tensor in gaussians[:3])
     colors = None if gaussians.colors is None else gaussians.colors.detach().cpu().numpy()
-    for own in colors if colors is not None and colors.ndim == 3 else [colors]:
-        arguments.check_finite(means, factors, opacities, own)
+    for view_colors in colors if colors is not None and colors.ndim == 3 else [colors]:
+        arguments.check_finite(means, factors, opacities, view_colors)
 
 
 def _batches(views: Sequence[CameraArguments]) -> list[list[int]]:

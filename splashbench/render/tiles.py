@@ -73,18 +73,18 @@ def from_tiles(tiles: NDArray[Number], modes: Modes, height: int, width: int) ->
     """The image [H, W, C] or [H, W] of a compact layout (see `to_tiles`); 0 in skipped tiles."""
     tiles = np.asarray(tiles)
     grid = tile_grid(width, height)
-    kept = np.asarray(modes) != SKIP
+    rendered = np.asarray(modes) != SKIP
     if tiles.ndim not in (3, 4) or tiles.shape[-2:] != (TILE_HEIGHT, TILE_WIDTH):
         raise ValueError(f"tiles is {list(tiles.shape)}, not [K, C, {TILE_HEIGHT}, {TILE_WIDTH}] or without C")
-    if kept.shape != grid or len(tiles) != kept.sum():
+    if rendered.shape != grid or len(tiles) != rendered.sum():
         raise ValueError(
-            f"{len(tiles)} tiles and modes {list(kept.shape)} with {kept.sum()} tiles do not make an image of "
+            f"{len(tiles)} tiles and modes {list(rendered.shape)} with {rendered.sum()} tiles do not make an image of "
             f"{height}x{width}, which has {list(grid)}"
         )
     planar = tiles.ndim == 4
     tiles = np.moveaxis(tiles, 1, 3) if planar else tiles
-    whole = np.zeros((*grid, TILE_HEIGHT, TILE_WIDTH, *tiles.shape[3:]), tiles.dtype)
-    whole[kept] = tiles
+    blocks = np.zeros((*grid, TILE_HEIGHT, TILE_WIDTH, *tiles.shape[3:]), tiles.dtype)
+    blocks[rendered] = tiles
     rows, columns = grid
-    image = whole.swapaxes(1, 2).reshape(rows * TILE_HEIGHT, columns * TILE_WIDTH, *tiles.shape[3:])
+    image = blocks.swapaxes(1, 2).reshape(rows * TILE_HEIGHT, columns * TILE_WIDTH, *tiles.shape[3:])
     return np.ascontiguousarray(image[:height, :width])

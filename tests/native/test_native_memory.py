@@ -54,7 +54,7 @@ def test_a_small_need_does_not_take_a_large_buffer():
 
 
 def test_only_so_much_is_kept(monkeypatch):
-    monkeypatch.setattr(memory, "KEPT_BYTES", 10_000_000)
+    monkeypatch.setattr(memory, "MAX_BYTES", 10_000_000)
     arrays = [memory.empty(SHAPE) for _ in range(8)]  # 3.6 MB each
     assert len(memory._buffers) == 2
     for i, array in enumerate(arrays):

@@ -266,7 +266,6 @@ def _render_in_child(arrays: list[np.ndarray], camera: Camera, queue: multiproce
     queue.put(everything(arrays, camera, 3))
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_process_renders(camera):
     arrays = scatter(20000)

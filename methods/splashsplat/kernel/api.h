@@ -1,4 +1,4 @@
-// The C interface of SplashSplat's kernel, which library.py states to Python. Arrays are C-contiguous float32 unless said
+// The C interface of SplashSplat's kernel, which library.py declares to Python. Arrays are C-contiguous float32 unless said
 // otherwise.
 #pragma once
 

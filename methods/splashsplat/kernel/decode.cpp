@@ -197,12 +197,12 @@ double color_variance(const SplashCarriers& c, int k, const float* colors, float
 
 }  // namespace
 
-Weights::Weights(const SplashHeads& given)
-    : heads(given),
-      inputs(given.features + 4),
-      outputs(7 * given.children + given.hidden),
+Weights::Weights(const SplashHeads& source)
+    : heads(source),
+      inputs(source.features + 4),
+      outputs(7 * source.children + source.hidden),
       first_step(in_vectors(inputs)),
-      second_step(given.hidden + 1) {
+      second_step(source.hidden + 1) {
     const int size = heads.features, k = heads.children;
     float* row = first.fit(static_cast<size_t>(outputs) * first_step);
     std::fill(row, row + static_cast<size_t>(outputs) * first_step, 0.0f);
@@ -235,13 +235,13 @@ void decode(const Weights& w, const SplashCarriers& c, const SplashChildren& out
         static thread_local Buffer<float> dropped;
         scratch.inputs.fit(w.inputs * BLOCK);
         scratch.children.fit(16 * at.k * BLOCK);
-        double own[2] = {0.0, 0.0};
+        double piece_sums[2] = {0.0, 0.0};
         for (int64_t block = piece * BLOCKS_PER_PIECE; block < std::min(blocks, (piece + 1) * BLOCKS_PER_PIECE); ++block) {
             float* const here = kept == nullptr ? dropped.fit(at.total * BLOCK) : kept + block * at.total * BLOCK;
-            decode_block(w, at, c, part_of(c.count, block), out, here, scratch, own);
+            decode_block(w, at, c, part_of(c.count, block), out, here, scratch, piece_sums);
         }
-        sums[2 * piece] = own[0];
-        sums[2 * piece + 1] = own[1];
+        sums[2 * piece] = piece_sums[0];
+        sums[2 * piece + 1] = piece_sums[1];
     });
     if (c.cells == nullptr) return;
     const int pairs = at.k * (at.k - 1) / 2;

@@ -99,8 +99,8 @@ def decode(heads: Heads, features: Tensor, log_scales: Tensor, instant: Instant,
     Raises TypeError or ValueError naming the argument.
     """
     _check(heads, features, log_scales, instant, rows)
-    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in (features, log_scales, *heads.weights))
-    return Decoded(*_Decode.apply(features, log_scales, *heads.weights, heads, instant, rows, wanted))
+    needs_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in (features, log_scales, *heads.weights))
+    return Decoded(*_Decode.apply(features, log_scales, *heads.weights, heads, instant, rows, needs_gradients))
 
 
 def _check(heads: Heads, features: Tensor, log_scales: Tensor, instant: Instant, rows: Tensor | None) -> None:
@@ -126,8 +126,8 @@ def _check(heads: Heads, features: Tensor, log_scales: Tensor, instant: Instant,
         if value.dtype != torch.float32 or value.device.type != "cpu":
             raise TypeError(f"{name} is {value.dtype} on {value.device}, not float32 on the CPU")
         if list(value.shape) != [sizes[letter] for letter in letters]:
-            wanted = ", ".join(f"{letter} = {sizes[letter]}" for letter in letters)
-            raise ValueError(f"{name} is {list(value.shape)}, not [{wanted}]")
+            expected = ", ".join(f"{letter} = {sizes[letter]}" for letter in letters)
+            raise ValueError(f"{name} is {list(value.shape)}, not [{expected}]")
     if not 1 <= sizes["K"] <= MAX_CHILDREN:
         raise ValueError(f"the heads give {sizes['K']} children, not 1 to {MAX_CHILDREN}")
     for name, index, limit in (("rows", rows, len(features)), ("cells", instant.cells, instant.cell_count)):
@@ -178,30 +178,30 @@ class _Call:
 
 
 class _Decode(torch.autograd.Function):
-    """Inputs: features, log_scales, the ten weights; then heads, instant, rows, and whether gradients are wanted."""
+    """Inputs: features, log_scales, the ten weights; then heads, instant, rows, and whether gradients are needed."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, log_scales: Tensor, *rest: Any) -> tuple[Tensor | None, ...]:
-        *weights, heads, instant, rows, wanted = rest
+        *weights, heads, instant, rows, needs_gradients = rest
         call = _Call(heads, features, log_scales, tuple(weights), instant, rows)
         n, k, library = call.count, call.children, KERNEL.library
         children = [_empty(n, k, 3), _empty(n, k, 3, 3), _empty(n, k), _empty(n, k, 3), _empty(n, k, 3)]
-        kept = _empty(library.splash_decode_kept(ctypes.byref(call.heads), n)) if wanted else None
+        activations = _empty(library.splash_decode_kept(ctypes.byref(call.heads), n)) if needs_gradients else None
         cell_colors = None if instant.cells is None else _empty(call.cell_count, 3)
         penalties = (ctypes.c_double * 3)()
         status = library.splash_decode(
             ctypes.byref(call.heads),
             ctypes.byref(call.carriers),
             ctypes.byref(ChildrenStruct(*map(_address, children))),
-            _address(kept),
+            _address(activations),
             _address(cell_colors),
             penalties,
             kernel_threads(),
         )
         if status != DONE:
             raise MemoryError("the decoder is out of memory: fewer carriers need less")
-        if wanted:
-            ctx.call, ctx.kept, ctx.cell_colors = call, kept, cell_colors
+        if needs_gradients:
+            ctx.call, ctx.activations, ctx.cell_colors = call, activations, cell_colors
             # The kernel reads the inputs again; torch notices where they were changed in place since.
             ctx.save_for_backward(features, log_scales, *weights, *([] if rows is None else [rows]))
         ctx.set_materialize_grads(False)
@@ -213,7 +213,7 @@ class _Decode(torch.autograd.Function):
         features, log_scales, *weights = ctx.saved_tensors
         rows = weights.pop() if len(weights) > 10 else None
         call: _Call = ctx.call
-        given = [None if g is None else g.contiguous() for g in outer[:5]]
+        grad_children = [None if g is None else g.contiguous() for g in outer[:5]]
         penalties = (ctypes.c_double * 3)(*([0.0] * 3 if outer[5] is None else outer[5].tolist()))
         by_rows = [_empty(call.count, features.shape[1]), _empty(call.count, 3)]
         by_weights = [torch.empty(w.shape) for w in weights]
@@ -221,9 +221,9 @@ class _Decode(torch.autograd.Function):
         status = KERNEL.library.splash_decode_backward(
             ctypes.byref(call.heads),
             ctypes.byref(call.carriers),
-            _address(ctx.kept),
+            _address(ctx.activations),
             _address(ctx.cell_colors),
-            ctypes.byref(ChildrenStruct(*map(_address, given))),
+            ctypes.byref(ChildrenStruct(*map(_address, grad_children))),
             penalties,
             kernel_threads(),
             ctypes.byref(gradients),

@@ -29,11 +29,11 @@ struct ChildRows {
 
 // What one unit of each penalty weighs for one carrier (the first two), one colour (the last).
 struct PenaltyWeights {
-    PenaltyWeights(const SplashCarriers& c, int k, const double given[3]) {
+    PenaltyWeights(const SplashCarriers& c, int k, const double grad[3]) {
         const double carriers = static_cast<double>(std::max<int64_t>(c.count, 1));
-        trace = static_cast<float>(given[0] / (carriers * k));
-        hinge = static_cast<float>(given[1] / (carriers * std::max(k * (k - 1) / 2, 1)));
-        color = static_cast<float>(given[2] / (carriers * 3 * k));
+        trace = static_cast<float>(grad[0] / (carriers * k));
+        hinge = static_cast<float>(grad[1] / (carriers * std::max(k * (k - 1) / 2, 1)));
+        color = static_cast<float>(grad[2] / (carriers * 3 * k));
     }
 
     float trace, hinge, color;
@@ -234,8 +234,8 @@ void decode_backward(const Weights& w, const SplashCarriers& c, const float* kep
     const WeightSums layout(w);
     const PenaltyWeights penalties(c, at.k, grad_penalties);
     const int64_t pieces = pieces_of(c.count), blocks = blocks_of(c.count);
-    static thread_local Buffer<float> kept_sums;
-    float* const sums = kept_sums.fit(std::max<int64_t>(pieces, 1) * layout.total);
+    static thread_local Buffer<float> buffer;
+    float* const sums = buffer.fit(std::max<int64_t>(pieces, 1) * layout.total);
     if (pieces == 0) std::fill(sums, sums + layout.total, 0.0f);
     in_pieces(threads, pieces, 1, [&](int64_t piece, int64_t, int) {
         static thread_local Scratch scratch;
@@ -247,11 +247,11 @@ void decode_backward(const Weights& w, const SplashCarriers& c, const float* kep
         scratch.log_scales.fit(3 * BLOCK);
         // Columns of padding are read by the products and never written.
         std::fill(scratch.color.data(), scratch.color.data() + BLOCK * layout.second_step, 0.0f);
-        float* const own = sums + piece * layout.total;
-        std::fill(own, own + layout.total, 0.0f);
+        float* const piece_sums = sums + piece * layout.total;
+        std::fill(piece_sums, piece_sums + layout.total, 0.0f);
         for (int64_t block = piece * BLOCKS_PER_PIECE; block < std::min(blocks, (piece + 1) * BLOCKS_PER_PIECE); ++block) {
             backward_block(w, at, c, part_of(c.count, block), kept + block * at.total * BLOCK, cell_colors, grad, penalties,
-                           out, layout, own, scratch);
+                           out, layout, piece_sums, scratch);
         }
     });
     unpack(w, layout, sums, pieces, out);

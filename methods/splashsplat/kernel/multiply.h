@@ -46,15 +46,15 @@ inline void multiply_rows(Left a, const float* b, int64_t b_step, float* c, int6
 // LANES, B and C are aligned for vectors, their rows b_step and c_step floats long. 6 x 2 sums fill the registers of AVX2.
 inline void multiply(Left a, const float* b, int64_t b_step, float* c, int64_t c_step, int rows, int depth, int columns,
                      bool add = false) {
-    constexpr int MOST = 6;
-    for (int row = 0; row < rows; row += MOST, a.at += MOST * a.step, c += MOST * c_step) {
+    constexpr int MAX_ROWS = 6;
+    for (int row = 0; row < rows; row += MAX_ROWS, a.at += MAX_ROWS * a.step, c += MAX_ROWS * c_step) {
         switch (rows - row) {
             case 1: return multiply_rows<1>(a, b, b_step, c, c_step, depth, columns, add);
             case 2: return multiply_rows<2>(a, b, b_step, c, c_step, depth, columns, add);
             case 3: return multiply_rows<3>(a, b, b_step, c, c_step, depth, columns, add);
             case 4: return multiply_rows<4>(a, b, b_step, c, c_step, depth, columns, add);
             case 5: return multiply_rows<5>(a, b, b_step, c, c_step, depth, columns, add);
-            default: multiply_rows<MOST>(a, b, b_step, c, c_step, depth, columns, add);
+            default: multiply_rows<MAX_ROWS>(a, b, b_step, c, c_step, depth, columns, add);
         }
     }
 }

@@ -166,8 +166,8 @@ void window_losses(const SplashWindow& w, const float* image, const float* alpha
     Buffer<double> parts;
     parts.fit(w.height / ROWS_PER_PIECE + 1);
     const int64_t pieces = by_rows(threads, w.height, [&](int begin, int end, int64_t piece) {
-        static thread_local Buffer<float> kept;
-        float* const mask = kept.fit(w.width);
+        static thread_local Buffer<float> mask_row;
+        float* const mask = mask_row.fit(w.width);
         parts[piece] = 0.0;
         for (int y = begin; y < end; ++y) {
             read_mask(w, y, mask);
@@ -187,8 +187,8 @@ void window_gradients(const SplashWindow& w, const float* image, const float* al
     const float by_step = static_cast<float>(weights[1] / (total.pairs + EPSILON));
     const float by_alpha = static_cast<float>(weights[2]);
     by_rows(threads, w.height, [&](int begin, int end, int64_t) {
-        static thread_local Buffer<float> kept;
-        float* const mask = kept.fit(w.width);
+        static thread_local Buffer<float> mask_row;
+        float* const mask = mask_row.fit(w.width);
         for (int y = begin; y < end; ++y) {
             read_mask(w, y, mask);
             const float* const row = alpha + static_cast<int64_t>(y) * w.width;

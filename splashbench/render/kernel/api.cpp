@@ -20,14 +20,14 @@ namespace splash {
 namespace {
 
 // Frames given back, most recent last: their buffers fit the next call.
-constexpr size_t KEPT = 4;
-constexpr int64_t KEPT_BYTES = int64_t(1) << 28;  // of each; larger ones are freed
-std::mutex kept_mutex;
-std::vector<SplashFrame*>& kept() {
+constexpr size_t MAX_SPARE = 4;
+constexpr int64_t MAX_SPARE_BYTES = int64_t(1) << 28;  // of each; larger ones are freed
+std::mutex spare_mutex;
+std::vector<SplashFrame*>& spare_frames() {
     static std::vector<SplashFrame*>* const frames = [] {
-        auto* const made = new std::vector<SplashFrame*>;
-        made->reserve(KEPT);
-        return made;
+        auto* const created = new std::vector<SplashFrame*>;
+        created->reserve(MAX_SPARE);
+        return created;
     }();
     return *frames;
 }
@@ -36,36 +36,36 @@ std::vector<SplashFrame*>& kept() {
 void guard_forks() {
     static std::once_flag once;
     std::call_once(once, [] {
-        pthread_atfork([] { kept_mutex.lock(); }, [] { kept_mutex.unlock(); }, [] { kept_mutex.unlock(); });
+        pthread_atfork([] { spare_mutex.lock(); }, [] { spare_mutex.unlock(); }, [] { spare_mutex.unlock(); });
     });
 }
 
 SplashFrame* take_frame() {
     guard_forks();
     {
-        std::lock_guard<std::mutex> lock(kept_mutex);
-        if (!kept().empty()) {
-            SplashFrame* const frame = kept().back();
-            kept().pop_back();
+        std::lock_guard<std::mutex> lock(spare_mutex);
+        if (!spare_frames().empty()) {
+            SplashFrame* const frame = spare_frames().back();
+            spare_frames().pop_back();
             return frame;
         }
     }
     return new SplashFrame();
 }
 
-Camera camera_of(const SplashCamera& given) {
+Camera camera_of(const SplashCamera& exact) {
     Camera camera;
-    camera.exact = given;
-    for (int i = 0; i < 9; ++i) camera.rotation[i] = static_cast<float>(given.world_to_camera[i / 3 * 4 + i % 3]);
-    camera.fx = static_cast<float>(given.fx);
-    camera.fy = static_cast<float>(given.fy);
-    camera.width = given.width;
-    camera.height = given.height;
-    const double margin_x = JACOBIAN_MARGIN * given.width, margin_y = JACOBIAN_MARGIN * given.height;
-    camera.min_tx = static_cast<float>((-given.cx - margin_x) / given.fx);
-    camera.max_tx = static_cast<float>((given.width - given.cx + margin_x) / given.fx);
-    camera.min_ty = static_cast<float>((-given.cy - margin_y) / given.fy);
-    camera.max_ty = static_cast<float>((given.height - given.cy + margin_y) / given.fy);
+    camera.exact = exact;
+    for (int i = 0; i < 9; ++i) camera.rotation[i] = static_cast<float>(exact.world_to_camera[i / 3 * 4 + i % 3]);
+    camera.fx = static_cast<float>(exact.fx);
+    camera.fy = static_cast<float>(exact.fy);
+    camera.width = exact.width;
+    camera.height = exact.height;
+    const double margin_x = JACOBIAN_MARGIN * exact.width, margin_y = JACOBIAN_MARGIN * exact.height;
+    camera.min_tx = static_cast<float>((-exact.cx - margin_x) / exact.fx);
+    camera.max_tx = static_cast<float>((exact.width - exact.cx + margin_x) / exact.fx);
+    camera.min_ty = static_cast<float>((-exact.cy - margin_y) / exact.fy);
+    camera.max_ty = static_cast<float>((exact.height - exact.cy + margin_y) / exact.fy);
     return camera;
 }
 
@@ -121,79 +121,79 @@ extern "C" {
 
 int splash_forward(const SplashCamera* camera, const SplashGaussians* gaussians, const SplashOutput* output,
                    const SplashFrame* frozen, int32_t threads, SplashFrame** result) {
-    SplashFrame* held = nullptr;
+    SplashFrame* handle = nullptr;
     try {
-        held = splash::take_frame();
-        splash::Frame& frame = held->frame;
+        handle = splash::take_frame();
+        splash::Frame& frame = handle->frame;
         frame.compact = output->compact != 0;
         frame.background = output->background;
         frame.background_per_pixel = output->background_per_pixel != 0;
         const int status = splash::prepare(frame, *camera, *gaussians, output->depth != 0, output->modes,
                                            frozen == nullptr ? nullptr : &frozen->frame, threads);
         if (status != SPLASH_DONE) {
-            splash_release(held);
+            splash_release(handle);
             return status;
         }
         splash::blend(frame, output->color, output->opacity);
-        *result = held;
+        *result = handle;
         return SPLASH_DONE;
     } catch (...) {  // nothing but std::bad_alloc is thrown
-        delete held;
+        delete handle;
         return SPLASH_OUT_OF_MEMORY;
     }
 }
 
 int splash_freeze(const SplashCamera* camera, const SplashGaussians* gaussians, int32_t depth, int32_t threads,
                   SplashFrame** result) {
-    SplashFrame* held = nullptr;
+    SplashFrame* handle = nullptr;
     try {
-        held = new SplashFrame();
-        held->frame.frozen_itself = true;
-        const int status = splash::prepare(held->frame, *camera, *gaussians, depth != 0, nullptr, nullptr, threads);
+        handle = new SplashFrame();
+        handle->frame.frozen_itself = true;
+        const int status = splash::prepare(handle->frame, *camera, *gaussians, depth != 0, nullptr, nullptr, threads);
         if (status != SPLASH_DONE) {
-            delete held;
+            delete handle;
             return status;
         }
-        splash::bake(held->frame);
-        *result = held;
+        splash::bake(handle->frame);
+        *result = handle;
         return SPLASH_DONE;
     } catch (...) {  // nothing but std::bad_alloc is thrown
-        delete held;
+        delete handle;
         return SPLASH_OUT_OF_MEMORY;
     }
 }
 
-int splash_backward(SplashFrame* held, const float* grad_color, const float* grad_opacity, int32_t threads,
+int splash_backward(SplashFrame* handle, const float* grad_color, const float* grad_opacity, int32_t threads,
                     const SplashGradients* gradients) {
     try {
-        held->frame.threads = splash::workers(threads);
-        splash::backward(held->frame, grad_color, grad_opacity, *gradients);
+        handle->frame.threads = splash::workers(threads);
+        splash::backward(handle->frame, grad_color, grad_opacity, *gradients);
         return SPLASH_DONE;
     } catch (...) {  // nothing but std::bad_alloc is thrown
         return SPLASH_OUT_OF_MEMORY;
     }
 }
 
-void splash_release(SplashFrame* held) {
-    if (held == nullptr) return;
-    if (!held->frame.frozen_itself && splash_frame_bytes(held) <= splash::KEPT_BYTES) {
-        std::lock_guard<std::mutex> lock(splash::kept_mutex);
-        if (splash::kept().size() < splash::KEPT) {
-            splash::kept().push_back(held);
+void splash_release(SplashFrame* handle) {
+    if (handle == nullptr) return;
+    if (!handle->frame.frozen_itself && splash_frame_bytes(handle) <= splash::MAX_SPARE_BYTES) {
+        std::lock_guard<std::mutex> lock(splash::spare_mutex);
+        if (splash::spare_frames().size() < splash::MAX_SPARE) {
+            splash::spare_frames().push_back(handle);
             return;
         }
     }
-    delete held;
+    delete handle;
 }
 
 void splash_trim(void) {
-    std::lock_guard<std::mutex> lock(splash::kept_mutex);
-    for (SplashFrame* held : splash::kept()) delete held;
-    splash::kept().clear();
+    std::lock_guard<std::mutex> lock(splash::spare_mutex);
+    for (SplashFrame* handle : splash::spare_frames()) delete handle;
+    splash::spare_frames().clear();
 }
 
-int64_t splash_frame_bytes(const SplashFrame* held) {
-    const splash::Frame& f = held->frame;
+int64_t splash_frame_bytes(const SplashFrame* handle) {
+    const splash::Frame& f = handle->frame;
     return static_cast<int64_t>(
         f.modes.bytes() + f.active_above.bytes() + f.projected.bytes() + f.keys.bytes() + f.ranks.bytes() + f.items.bytes() +
         f.other_items.bytes() + f.histograms.bytes() + f.splats.bytes() + f.channel_table.bytes() + f.slot_starts.bytes() +
@@ -201,10 +201,10 @@ int64_t splash_frame_bytes(const SplashFrame* held) {
         f.transmittance.bytes() + f.stops.bytes() + f.baked.bytes() + f.compact_places.bytes() + f.slots.bytes());
 }
 
-void splash_frame_counts(const SplashFrame* held, int64_t counts[3]) {
-    counts[0] = held->frame.drawn;
-    counts[1] = held->frame.tile_starts[held->frame.tiles];
-    counts[2] = held->frame.placed;
+void splash_frame_counts(const SplashFrame* handle, int64_t counts[3]) {
+    counts[0] = handle->frame.drawn;
+    counts[1] = handle->frame.tile_starts[handle->frame.tiles];
+    counts[2] = handle->frame.placed;
 }
 
 int splash_abi_version(void) { return SPLASH_ABI_VERSION; }

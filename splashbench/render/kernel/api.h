@@ -1,4 +1,4 @@
-// The renderer's C interface, which ../native.py states to Python. Arrays are C-contiguous float32 unless said otherwise.
+// The renderer's C interface, which ../native.py declares to Python. Arrays are C-contiguous float32 unless said otherwise.
 //
 // N Gaussians, C channels (0 to 32), H x W pixels, tiles of splash_tile_height() x splash_tile_width() pixels row by row.
 #pragma once

@@ -17,7 +17,7 @@ enum Mode : uint8_t { SKIP = 0, OPACITY = 1, COLOR = 2 };
 // the quadratic form of the inverse covariance with its square completed: a difference of large numbers, where a needle
 // lies askew, is then taken between coordinates and not between their squares.
 struct alignas(64) Splat {
-    double x, y;                    // centre, px: in float a wide image's last columns would have but 13 bits of a pixel
+    double x, y;                    // centre, px; a float leaves 13 bits for parts of a pixel in a wide image's last columns
     float root, slope, fall;        // 1/px, px per row, 1/px^2
     float log2_opacity;
     float per_square;               // 1 / root^2

@@ -23,16 +23,16 @@ void collect(Frame& frame, uint32_t& least, uint32_t& largest) {
     int64_t starts[MAX_THREADS + 1] = {0};
     uint32_t low[MAX_THREADS], high[MAX_THREADS];
     in_parts(parts, count, [&](int64_t begin, int64_t end, int part) {
-        int64_t kept = 0;
+        int64_t drawn_rows = 0;
         uint32_t first = NOT_DRAWN, last = 0;
         for (int64_t i = begin; i < end; ++i) {
             const uint32_t key = frame.keys[i];
             const bool drawn = key != NOT_DRAWN;
-            kept += drawn;
+            drawn_rows += drawn;
             first = std::min(first, key);
             last = drawn ? std::max(last, key) : last;
         }
-        starts[part + 1] = kept;
+        starts[part + 1] = drawn_rows;
         low[part] = first;
         high[part] = last;
     });

@@ -48,16 +48,16 @@ class PlainDecoder(Decoder):
         return children, None if cells is None else penalties(children, cells)
 
 
-def plain(given: Case) -> Case:
+def plain(sample: Case) -> Case:
     """The same case, decoded by plain torch."""
-    decoder = PlainDecoder(given[0].settings)
-    decoder.load_state_dict(given[0].state_dict())
-    return decoder, *given[1:]
+    decoder = PlainDecoder(sample[0].settings)
+    decoder.load_state_dict(sample[0].state_dict())
+    return decoder, *sample[1:]
 
 
-def outcome(given: Case, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+def outcome(sample: Case, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     """Children, penalties, and the gradients of a sum of all of them with weights."""
-    decoder, features, log_scales, rows, state, eye, cells = given
+    decoder, features, log_scales, rows, state, eye, cells = sample
     decoder = copy.deepcopy(decoder).to(dtype)
     tables = [table.to(dtype, copy=True).requires_grad_() for table in (features, log_scales)]
     state = CarrierState(*[None if value is None else value.to(dtype) for value in vars(state).values()])
@@ -75,15 +75,17 @@ def outcome(given: Case, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     return {name: value.detach() for name, value in values.items()} | gradients
 
 
-def assert_same(got: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], plain: dict[str, torch.Tensor]) -> None:
-    """`got` is as near to `wanted`, in double precision, as single precision allows: `plain` shows how near that is.
+def assert_same(
+    got: dict[str, torch.Tensor], expected: dict[str, torch.Tensor], plain: dict[str, torch.Tensor]
+) -> None:
+    """`got` is as near to `expected`, in double precision, as single precision allows: `plain` shows how near that is.
 
     Gradients of weights are sums over the carriers whose terms may cancel; how much is lost by that, only the
     definition in single precision can tell. Weight and bias of a layer have one yardstick.
     """
-    assert got.keys() == wanted.keys() == plain.keys()
+    assert got.keys() == expected.keys() == plain.keys()
     errors, unavoidable, sizes = defaultdict(list), defaultdict(list), defaultdict(list)
-    for name, value in wanted.items():
+    for name, value in expected.items():
         assert got[name].shape == value.shape
         assert got[name].dtype == plain[name].dtype == torch.float32
         layer = name.removesuffix(".weight").removesuffix(".bias")
@@ -106,8 +108,8 @@ def assert_same(got: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], p
     seed=st.integers(0, 1000),
 )
 def test_children_and_gradients_are_those_of_the_definition(n, seed, hidden_from_view, **sizes):
-    given = case(n, seed, hidden_from_view, **sizes)
-    assert_same(outcome(given, torch.float32), outcome(given, torch.float64), outcome(plain(given), torch.float32))
+    sample = case(n, seed, hidden_from_view, **sizes)
+    assert_same(outcome(sample, torch.float32), outcome(sample, torch.float64), outcome(plain(sample), torch.float32))
 
 
 def test_the_number_of_threads_does_not_matter():
@@ -164,14 +166,14 @@ def test_what_is_not_a_number_stays_one():
 def test_what_does_not_fit_is_refused(change, error, message):
     decoder, features, log_scales, rows, state, eye, _ = case(5)
     instant = Instant(state.positions, state.deformation, state.phi, eye, cells=torch.zeros(5).long(), cell_count=2)
-    own = {"features": features, "rows": rows}
+    tables = {"features": features, "rows": rows}
     for name, value in change.items():
-        if name in own:
-            own[name] = value
+        if name in tables:
+            tables[name] = value
         else:
             instant = replace(instant, **{name: value})
     with pytest.raises(error, match=message):
-        decode(decoder.heads(), own["features"], log_scales, instant, own["rows"])
+        decode(decoder.heads(), tables["features"], log_scales, instant, tables["rows"])
 
 
 @pytest.mark.parametrize("kind", [RowMoments, TorchRowMoments])
@@ -190,6 +192,22 @@ def test_adam_moves_like_torchs_and_leaves_other_rows_alone(kind, width):
         ours.step(rows, gradient, 0.1)
     np.testing.assert_allclose(table[rows], parameter.detach(), rtol=0, atol=2e-4)  # of steps that add up to ten
     assert torch.equal(table[others], start[others])
+
+
+def test_adam_moves_many_rows_alike_on_any_number_of_threads():
+    """Several pieces of rows, which threads share; torch moves the same table."""
+    start, gradient = torch.randn(5000, 7), torch.randn(5000, 7)
+    tables = []
+    for threads in (1, 2, 5):
+        table = start.clone()
+        with use_threads(threads):
+            RowMoments(table).step(torch.arange(5000), gradient, 0.1)
+        tables.append(table)
+    assert all(torch.equal(table, tables[0]) for table in tables)
+    parameter = start.double().requires_grad_()
+    parameter.grad = gradient.double()
+    torch.optim.Adam([parameter], lr=0.1).step()
+    np.testing.assert_allclose(tables[0], parameter.detach(), rtol=0, atol=1e-5)
 
 
 def test_adam_counts_the_steps_of_each_row():

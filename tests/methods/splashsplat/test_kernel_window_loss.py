@@ -29,9 +29,9 @@ def case(rows: int, columns: int, around: tuple[int, int, int, int] = (0, 0, 0, 
     return image, torch.rand(height, width), photograph
 
 
-def outcome(given: Case, kernel: bool) -> list[torch.Tensor]:
+def outcome(sample: Case, kernel: bool) -> list[torch.Tensor]:
     """The three losses, and the gradients of their sum with weights."""
-    image, alpha, photograph = given
+    image, alpha, photograph = sample
     kind = torch.float32 if kernel else torch.float64
     image, alpha = (value.to(kind, copy=True).requires_grad_() for value in (image, alpha))
     if kernel:
@@ -58,10 +58,10 @@ def outcome(given: Case, kernel: bool) -> list[torch.Tensor]:
     seed=st.integers(0, 1000),
 )
 def test_losses_and_gradients_are_those_of_the_definition(rows, columns, around, seed):
-    given = case(rows, columns, around, seed)
-    for got, wanted in zip(outcome(given, True), outcome(given, False)):
-        assert got.shape == wanted.shape
-        torch.testing.assert_close(got.double(), wanted, rtol=1e-5, atol=1e-8)
+    sample = case(rows, columns, around, seed)
+    for got, expected in zip(outcome(sample, True), outcome(sample, False)):
+        assert got.shape == expected.shape
+        torch.testing.assert_close(got.double(), expected, rtol=1e-5, atol=1e-8)
 
 
 def test_the_number_of_threads_does_not_matter():
