@@ -58,11 +58,9 @@ def leaderboard_table(sources: Sequence[ResultFile]) -> pd.DataFrame:
             ]
         )
     )
-    ranking = {"failed": True, "lpips": True, "psnr": False} | dict.fromkeys(
-        [*METHOD_COLUMNS, "failed_submission"], True
-    )
-    ascending = [*(True for _ in SCENE_COLUMNS), *ranking.values()]
-    return rows.reset_index().sort_values([*SCENE_COLUMNS, *ranking], ascending=ascending, ignore_index=True)
+    ranking = [*SCENE_COLUMNS, "failed", "lpips", "psnr", *METHOD_COLUMNS, "failed_submission"]
+    ascending = [column != "psnr" for column in ranking]
+    return rows.reset_index().sort_values(ranking, ascending=ascending, ignore_index=True)
 
 
 def _run(result: Result) -> dict[str, Any]:

@@ -83,6 +83,16 @@ def test_presets_and_settings_of_a_method_are_told_apart(make_result: Any) -> No
     assert all(re.fullmatch(r"alpha \[quick\] [0-9a-f]{8}", label) for label in labels[1:])
 
 
+def test_the_memory_charted_is_the_device_s_where_one_was_used(make_result: Any) -> None:
+    on_device = {"psnr": 20.0, "fit_seconds": 5.0, "peak_memory_bytes": 1e9, "peak_device_memory_bytes": 8e9}
+    results = [
+        make_result("alpha", **on_device),
+        make_result("beta", psnr=20.0, fit_seconds=5.0, peak_memory_bytes=2e9),
+    ]
+    (machine,) = machines([ResultFile(f"{i}.json", result) for i, result in enumerate(results)])
+    assert [entry.memory_bytes() for entry in machine.entries] == [8e9, 2e9]
+
+
 def test_a_run_without_a_fit_time_is_shown_as_such(make_result: Any) -> None:
     (machine,) = machines([ResultFile("a.json", make_result("alpha", psnr=20.0))])
     assert dict(machine.failures) == {"alpha: fit time not measured": 1}

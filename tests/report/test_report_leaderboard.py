@@ -68,6 +68,34 @@ def test_controls_are_marked_and_never_best(folder: Path) -> None:
     assert {row["method"]: row["control"] for row in _table(folder)}["nothing"] == "true"
 
 
+def test_a_low_sigma_d_is_not_best_since_a_smaller_cloud_has_it_too(make_result: Any) -> None:
+    sources = [
+        ResultFile(f"{name}.json", make_result(name, sigma_d=sigma, uniformity=sigma / 10))
+        for name, sigma in (("alpha", 20.0), ("beta", 30.0))
+    ]
+    line = next(s for s in to_markdown(leaderboard_table(sources), sources).splitlines() if s.startswith("| alpha"))
+    assert "**2.000**" in line
+    assert "| 20.0 |" in line
+
+
+def test_without_lpips_the_higher_psnr_comes_first(make_result: Any) -> None:
+    results = [make_result(name, psnr=psnr) for name, psnr in (("alpha", 19.0), ("beta", 21.0))]
+    table = leaderboard_table([ResultFile(f"{i}.json", result) for i, result in enumerate(results)])
+    assert list(table["method"]) == ["beta", "alpha"]
+
+
+def test_presets_of_rows_that_would_look_alike_name_their_settings(make_result: Any) -> None:
+    results = [
+        make_result("alpha", 0, psnr=20.0),
+        make_result("alpha", 0, psnr=21.0, settings={"grid": 48}),
+        make_result("beta", 0, psnr=19.0),
+    ]
+    sources = [ResultFile(f"{i}.json", result) for i, result in enumerate(results)]
+    lines = to_markdown(leaderboard_table(sources), sources).splitlines()
+    presets = [line.split(" | ")[1] for line in lines if line.startswith(("| alpha", "| beta"))]
+    assert presets == [f"best ({results[1].settings_digest})", f"best ({results[0].settings_digest})", "best"]
+
+
 def test_means_over_scenes_leave_out_methods_that_failed_on_one(folder: Path, make_result: Any) -> None:
     def means() -> dict[str, str]:
         sources = load_results(folder)

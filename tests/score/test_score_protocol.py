@@ -13,6 +13,8 @@ from splashbench.observe.consistency import inside_mask
 from splashbench.scene import Particles, Scene
 from splashbench.score import METRICS, PROTOCOL_V1, Protocol, Result, score_submission, shared_fields
 from splashbench.score.mixed import liquid_of_mixed
+from splashbench.score.protocol import MIN_TIMED_FRAMES, _costs
+from splashbench.submission import Record
 from splashbench.synth.balls import ball_centers
 
 NAMES = [
@@ -255,3 +257,10 @@ def test_ground_truth_is_never_read_from_the_submission(balls: Scene, tmp_path: 
     seal(oracle.directory, oracle.identity, oracle.record)
     result = score_submission(balls, Submission.open(oracle.directory), track=quiet)
     assert result.metrics["psnr"].value < 20
+
+
+@pytest.mark.parametrize(("timed", "fps"), [(MIN_TIMED_FRAMES - 1, None), (MIN_TIMED_FRAMES, 30.0), (None, 30.0)])
+def test_a_frame_rate_needs_a_hundred_timed_frames(timed: int | None, fps: float | None) -> None:
+    value = _costs(Record(fit_seconds=60.0, render_fps=30.0, timed_frames=timed))["render_fps"]
+    assert value.value == fps
+    assert value.reason == (None if fps else "only 99 frames were timed, not 100")

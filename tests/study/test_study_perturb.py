@@ -117,6 +117,13 @@ def test_views_that_cannot_be_are_told(balls: Scene) -> None:
         changes(balls, StudyVariant(name="v", train_views=("1", "9")), 0)
 
 
+def test_of_cameras_that_matter_equally_little_the_last_is_dropped(balls: Scene) -> None:
+    scene = _Without(balls)
+    scene.test = ("6",)  # between 1 and 2: none of 3, 4 and 5 narrows its gap
+    assert nested_views(scene, 4) == ("1", "2", "3", "4")
+    assert nested_views(scene, 2) == ("1", "2")
+
+
 class _Without:
     """A scene that has some training views less."""
 
