@@ -12,7 +12,7 @@ from splashbench.observe import signed_distance_fields
 from splashbench.render import rasterize_arrays
 
 
-class Settings(MethodConfig):
+class HullPointsSettings(MethodConfig):
     presets: ClassVar[dict] = {"best": {}, "quick": {"points": 2000}}  # the first one is the default
     points: int = 8000  # per frame
     cells: int = 64  # of the hull's grid, along its longest side
@@ -21,14 +21,14 @@ class Settings(MethodConfig):
 class HullPoints(Method):
     id = "hull_points"
     title = "points of the visual hull, coloured from the training views"
-    Config = Settings
+    Config = HullPointsSettings
 
-    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Model:
+    def fit(self, scene: TrainingScene, config: HullPointsSettings, run: Run) -> Model:
         rng = np.random.default_rng(run.seed)
         fields = signed_distance_fields(scene, cells_longest_axis=config.cells)
         positions = np.zeros((scene.n_frames, config.points, 3), np.float32)
         active = np.zeros((scene.n_frames, config.points), bool)
-        colours = np.full((scene.n_frames, config.points, 3), 0.5, np.float32)
+        colors = np.full((scene.n_frames, config.points, 3), 0.5, np.float32)
         for t in range(scene.n_frames):
             run.progress(t / scene.n_frames, "sampling the hull")
             inside = np.argwhere(fields.phi[t] < 0)
@@ -37,15 +37,15 @@ class HullPoints(Method):
             cells = inside[rng.integers(0, len(inside), config.points)]
             positions[t] = fields.origin + (cells + rng.uniform(-0.5, 0.5, cells.shape)) * fields.voxel
             active[t] = True
-            seen = []
+            samples = []
             for name, camera in scene.cameras.items():
                 uv, _ = camera.project(positions[t])
                 column = np.clip(uv[:, 0].astype(int), 0, camera.width - 1)
                 row = np.clip(uv[:, 1].astype(int), 0, camera.height - 1)
-                seen.append(scene.image(name, t)[row, column] / 255.0)
-            colours[t] = np.median(seen, axis=0)
+                samples.append(scene.image(name, t)[row, column] / 255.0)
+            colors[t] = np.median(samples, axis=0)
         background = np.mean([scene.image(name, 0).mean(axis=(0, 1)) for name in scene.train], axis=0) / 255.0
-        return Model(scene.times, positions, active, colours, background, fields.voxel)
+        return Model(scene.times, positions, active, colors, background, fields.voxel)
 
     def load(self, directory: Path, scene: TrainingScene) -> Model:
         with np.load(directory / "model.npz", allow_pickle=False) as data:
@@ -53,26 +53,26 @@ class HullPoints(Method):
 
 
 class Model(Fitted):
-    ARRAYS = ("positions", "active", "colours", "background", "radius")
+    ARRAYS = ("positions", "active", "colors", "background", "radius")
 
-    def __init__(self, times, positions, active, colours, background, radius) -> None:  # type: ignore[no-untyped-def]
-        self.times, self.positions, self.active, self.colours = times, positions, active, colours
+    def __init__(self, times, positions, active, colors, background, radius) -> None:  # type: ignore[no-untyped-def]
+        self.times, self.positions, self.active, self.colors = times, positions, active, colors
         self.background, self.radius = background, float(radius)
 
     def render(self, camera: Camera, time: float) -> Render:
         t = int(np.abs(self.times - time).argmin())
-        shown = self.active[t]
-        n = int(shown.sum())
+        active = self.active[t]
+        n = int(active.sum())
         factors = np.broadcast_to(np.eye(3, dtype=np.float32) * self.radius / 2, (n, 3, 3))  # of covariances B B^T
         opacities = np.full(n, 0.8, np.float32)
-        points, colours = self.positions[t][shown], self.colours[t][shown]
-        return Render(*rasterize_arrays(points, factors, opacities, colours, camera, background=self.background))
+        points, colors = self.positions[t][active], self.colors[t][active]
+        return Render(*rasterize_arrays(points, factors, opacities, colors, camera, background=self.background))
 
     def particles(self) -> Particles:
         # Points are drawn anew in every frame. Even and odd frames take rows of their own, so that no row claims to be
         # one particle followed from a frame to the next.
-        own = np.arange(len(self.positions))[:, None] % 2 == np.arange(2).repeat(self.positions.shape[1])
-        return Particles(np.tile(self.positions, (1, 2, 1)), np.tile(self.active, (1, 2)) & own)
+        rows = np.arange(len(self.positions))[:, None] % 2 == np.arange(2).repeat(self.positions.shape[1])
+        return Particles(np.tile(self.positions, (1, 2, 1)), np.tile(self.active, (1, 2)) & rows)
 
     def save(self, directory: Path) -> None:
         np.savez(directory / "model.npz", **{name: getattr(self, name) for name in self.ARRAYS})

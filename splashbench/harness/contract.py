@@ -1,8 +1,8 @@
 """The method contract: what a reconstruction method implements, and what it is given.
 
-A method sees training views only; test views reach it as poses and times. It runs in a child process; the harness,
-never the method, measures time, memory, bytes and frame rate, and turns a crash, a NaN, a hang or running out of
-memory into a recorded status. CONTRIBUTING.md shows a complete method in one file.
+A method sees training views only; test views reach it as poses and times. It runs in a child process. The harness,
+never the method, measures time, memory, bytes and frame rate. A crash, a NaN, a hang or a lack of memory becomes a
+recorded status. CONTRIBUTING.md shows a complete method in one file.
 """
 
 from __future__ import annotations
@@ -101,13 +101,18 @@ class Run:
         load: Callable[[Path], T],
         seeded: bool = True,
     ) -> T:
-        """What `fit()` gives, or what it gave an earlier run of the same study, scene, key, seed and device.
+        """What `fit()` returns, or what it returned in an earlier run of the same study, scene, key, seed and device.
 
-        For a part of the fit that does not depend on the rest, such as a frozen background `name`. `key` has every
-        setting and version the part depends on, in values that JSON has; `save` writes it into an empty folder and
-        `load` reads it from there, to the same bytes in renders. The harness adds the seconds of the earlier fit.
-        seeded: whether the part depends on the seed; where not, runs of other seeds have it, too. No part may be had
-        within the fit of another: the seconds would be wrong.
+        It is for a part of the fit that does not depend on the rest, such as a frozen background. No part may be asked
+        for within the fit of another: the seconds would be wrong.
+
+        Args:
+            name: of the part.
+            key: every setting and version that the part depends on, in values that JSON has.
+            save, load: write the part into an empty folder, and read it from there to the same bytes in renders.
+            seeded: whether the part depends on the seed; where not, runs of other seeds share it.
+
+        The harness adds the seconds of the earlier fit to this one's.
         """
         if self.cache is None:
             return fit()
@@ -153,8 +158,8 @@ class MethodConfig(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])
-            known = ", ".join(sorted(cls.model_fields)) or "none"
-            raise SplashbenchError(f"setting {key}: {first['msg']}; this method's settings: {known}") from None
+            fields = ", ".join(sorted(cls.model_fields)) or "none"
+            raise SplashbenchError(f"setting {key}: {first['msg']}; this method's settings: {fields}") from None
 
 
 class Fitted(ABC):
@@ -174,14 +179,17 @@ class Fitted(ABC):
     def signed_distance(self) -> SignedDistance | None:
         """The liquid's signed distance on the scene's timesteps, in scene units, or None for a method without one.
 
-        It says where the liquid is, its inside included. Where there is none, that is told from the particles.
+        It says where the liquid is, its inside included. Without one, scoring derives it from the particles.
         """
         return None
 
     @abstractmethod
     def save(self, directory: Path) -> None:
-        """Write the model into `directory` (exists, empty). Files under `static/` are what does not change over
-        time, such as a frozen background; everything else counts as dynamic storage. No pickles."""
+        """Write the model into `directory`, which is there and empty, without pickles.
+
+        What does not change over time, such as a frozen background, goes under `static/`. The rest counts as dynamic
+        storage.
+        """
 
 
 class Method(ABC):

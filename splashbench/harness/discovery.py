@@ -13,11 +13,11 @@ from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Method, MethodConfig
 
 GROUP = "splashbench.methods"
-#: Written by the harness itself, since no method sees a test image (adapter/oracle.py).
+#: The control that the harness writes itself, since no method sees a test image (oracle.py).
 ORACLE = "oracle"
-#: A code that runs by commands of its own (adapter/external.py).
+#: What is no method either: a code that runs by its own commands (external/).
 EXTERNAL = "external"
-# What a stranger's module may raise: a script that was taken for a method calls sys.exit().
+# What a module from elsewhere may raise: a script that was taken for a method calls sys.exit().
 _ANYTHING = (Exception, SystemExit)
 
 
@@ -49,7 +49,7 @@ def load_point(point: EntryPoint) -> Any:
         raise SplashbenchError(f"method {point.name!r} cannot be imported ({error}); install what it needs") from None
     except _ANYTHING as error:
         raise SplashbenchError(
-            f"method {point.name!r} cannot be imported ({type(error).__name__}: {error}); mend or remove its package"
+            f"method {point.name!r} cannot be imported ({type(error).__name__}: {error}); fix or remove its package"
         ) from None
 
 
@@ -68,7 +68,7 @@ def class_from_file(name: str) -> Any:
     try:
         spec.loader.exec_module(module)
     except _ANYTHING as error:
-        raise SplashbenchError(f"{path} cannot be imported ({type(error).__name__}: {error}); mend it") from None
+        raise SplashbenchError(f"{path} cannot be imported ({type(error).__name__}: {error}); fix it") from None
     if not hasattr(module, class_name):
         raise SplashbenchError(f"{path} has no class {class_name!r}; name the method's class after the colon")
     return getattr(module, class_name)
@@ -76,7 +76,7 @@ def class_from_file(name: str) -> Any:
 
 def _checked(method_class: type, name: str) -> Method:
     if not (isinstance(method_class, type) and issubclass(method_class, Method)):
-        raise SplashbenchError(f"{name!r} is not a splashbench.harness.contract.Method; subclass it")
+        raise SplashbenchError(f"{name!r} is not a splashbench.Method; subclass it")
     missing = sorted(getattr(method_class, "__abstractmethods__", ()))
     for attribute in ("id", "title"):
         if not hasattr(method_class, attribute):
@@ -89,4 +89,4 @@ def _checked(method_class: type, name: str) -> Method:
     try:
         return method_class()
     except _ANYTHING as error:
-        raise SplashbenchError(f"method {name!r} cannot be made ({type(error).__name__}: {error}); mend it") from None
+        raise SplashbenchError(f"method {name!r} cannot be made ({type(error).__name__}: {error}); fix it") from None

@@ -1,4 +1,4 @@
-"""What the harness and its child process say to each other: a request file in, JSON lines and a result file out."""
+"""Messages between the harness and its child process: a request file in, progress lines and an outcome file out."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from splashbench.submission import Status
 
 
 class Request(BaseModel):
-    """What a child process is to do: `phase` fit (scene -> model), import (somebody's output -> model), render (model
-    -> test views).
+    """What a child process is to do.
 
-    times: of the views to render, seconds by test camera; by default those of the scene's timesteps.
-    importer: whose models are imported and rendered, instead of the method's; source, export: what it reads them from.
+    Attributes:
+        phase: fit (scene -> model), import (an external code's output -> model), render (model -> test views).
+        times: of the views to render, seconds by test camera; by default those of the scene's timesteps.
+        importer: imports and renders a model instead of the method. source, export: what it reads it from.
     """
 
     model_config = ConfigDict(extra="forbid")

@@ -1,7 +1,7 @@
 """The child process in which a method runs, fits or renders, as a request file says.
 
 This is the harness's code around the method's: it holds the clock, checks every render, and writes what came out.
-Fitting and rendering are two processes, so a model that renders only in the memory that fitted it is found out.
+Fitting and rendering are two processes, so that a model which renders only in the memory that fitted it fails.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
     fitted = method.load(Path(request.model), scene)
     output = Path(request.output)
     times = request.times or {name: scene.camera_times[name].tolist() for name in scene.test_cameras}
-    views = [(scene.test_cameras[name], t, time) for name, own in times.items() for t, time in enumerate(own)]
+    views = [(scene.test_cameras[name], t, time) for name, seconds in times.items() for t, time in enumerate(seconds)]
     counts = []
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         report = _reporter(stream)
@@ -130,11 +130,11 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
     if geometry is not None:
         check_geometry(geometry, scene.n_frames)
         geometry.save(output / "geometry.npz")
-    known = [count for count in counts if count is not None]
+    counted = [count for count in counts if count is not None]
     return Outcome(
         render_fps=_frame_rate(fitted, scene, request.timing_frames),
         timed_frames=request.timing_frames,
-        primitives_per_frame=statistics.fmean(known) if known else None,
+        primitives_per_frame=statistics.fmean(counted) if counted else None,
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),
     )

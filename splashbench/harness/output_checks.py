@@ -1,4 +1,4 @@
-"""What a method returns, looked over: renders, particles, signed distance. A fault is a status and a reason."""
+"""Checks of what a method returns: renders, particles, signed distance. A fault is a status and a reason."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def checked_render(render: Render, camera: Camera, where: str) -> Render:
     if not isinstance(render, Render):
         raise Failure(Status.INCOMPLETE, f"{where}: render() returned {type(render).__name__}, not a Render")
     rgb, alpha = np.asarray(render.rgb), np.asarray(render.alpha)
-    wanted = (camera.height, camera.width)
-    if rgb.shape != (*wanted, 3) or alpha.shape != wanted:
+    size = (camera.height, camera.width)
+    if rgb.shape != (*size, 3) or alpha.shape != size:
         raise Failure(
-            Status.WRONG_SIZE, f"{where}: rgb is {rgb.shape} and alpha {alpha.shape}; the view is {wanted} pixels"
+            Status.WRONG_SIZE, f"{where}: rgb is {rgb.shape} and alpha {alpha.shape}; the view is {size} pixels"
         )
     if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
         raise Failure(Status.NOT_FINITE, f"{where}: the render has NaN or infinite pixels")
     for name, values in (("rgb", rgb), ("alpha", alpha)):
         # A little over is clipped; integers, or 0 to 255, are a mistake that clipping would hide as a white image.
         if values.dtype.kind != "f" or values.min() < -_OVERSHOOT or values.max() > 1 + _OVERSHOOT:
-            found = f"{values.dtype} from {values.min():g} to {values.max():g}"
-            raise Failure(Status.OUT_OF_RANGE, f"{where}: {name} is {found}, not floats in [0, 1]")
+            values_range = f"{values.dtype} from {values.min():g} to {values.max():g}"
+            raise Failure(Status.OUT_OF_RANGE, f"{where}: {name} is {values_range}, not floats in [0, 1]")
     return Render(rgb, alpha)
 
 

@@ -19,16 +19,18 @@ from splashbench.progress import Bar
 _POLL_SECONDS = 0.05
 _LOG_TAIL_LINES = 20
 _LOG_TAIL_BYTES = 20_000
-_TELL_SECONDS = 1.0
+_SILENT_SECONDS = 1.0
 #: In the environment of everything that a watched process starts, with a value of its own for each.
 _MARK = "SPLASHBENCH_RUN"
 
 
 @dataclass
 class Watched:
-    """How a process ended: its exit code (negative: the signal), whether the deadline killed it, peak memory, time.
+    """How a process ended.
 
-    strays: processes that had left its process group and were there still; they were killed.
+    Attributes:
+        exit_code: negative for a signal. timed_out: whether the deadline killed it.
+        log_tail: the last lines of its log. strays: processes that had left its group; they were killed.
     """
 
     exit_code: int
@@ -46,18 +48,22 @@ def watch(
     progress: Path,
     label: str,
     timeout_seconds: float | None,
-    tell_log: bool = False,
+    show_log: bool = False,
     keep_bar: bool = True,
 ) -> Watched:
     """Run `command` in a process group of its own until it ends or its time is up.
 
-    Standard output and error go to `log`; lines "FRACTION MESSAGE" appended to `progress` move the bar, which stays
-    on the terminal with `keep_bar`, and with `tell_log` the log's last line is shown where there are none. Memory is
-    the sum of resident sizes over the process tree, and the time that the process took is known, to 50 ms.
+    Args:
+        log: the file that standard output and error go to.
+        progress: the file whose lines "FRACTION MESSAGE", appended meanwhile, move the bar.
+        show_log: show the log's last line while no such line comes.
+        keep_bar: leave the bar on the terminal.
+
+    Memory is the sum of resident sizes over the process tree. It is looked at, and the time measured, every 50 ms.
     """
     environment = dict(os.environ)
     environment[_MARK] = mark = uuid.uuid4().hex
-    # Idle OpenMP threads that spin steal the renderer's cores (research: twice the time on two cores).
+    # Idle OpenMP threads that spin take the renderer's cores: twice the time on two cores.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
     with log.open("wb") as stream:
         process = subprocess.Popen(
@@ -71,16 +77,16 @@ def watch(
     start, peak, timed_out = time.monotonic(), 0, False
     bar = Bar(label, keep_bar)
     reader = _ProgressReader(progress)
-    told, fraction = start, 0.0
+    last_update, fraction = start, 0.0
     try:
         while process.poll() is None:
             peak = max(peak, _tree_memory(process.pid))
             for fraction, message in reader.new():
                 bar.update(fraction, message)
-                told = time.monotonic()
-            if tell_log and time.monotonic() - told > _TELL_SECONDS:
+                last_update = time.monotonic()
+            if show_log and time.monotonic() - last_update > _SILENT_SECONDS:
                 bar.update(fraction, " ".join(_tail(log)[-1:]))
-                told = time.monotonic()
+                last_update = time.monotonic()
             if timeout_seconds is not None and time.monotonic() - start > timeout_seconds:
                 timed_out = True
                 break

@@ -1,7 +1,7 @@
 """A part of a fit that several runs share, such as a frozen background: fitted once, then loaded.
 
-Only where the harness gives a run a folder for it (`Run.cache`), as a study does for its variants; ordinary runs fit
-everything. The seconds that the part took when it was fitted stay with it, so that no run's fit time leaves them out.
+This happens only where the harness gives a run a folder for it (`Run.cache`), as a study does for its variants.
+Ordinary runs fit everything. The seconds of the part's fit stay with it, so that no run's fit time leaves them out.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class PartRecord(BaseModel):
 
 @dataclass(frozen=True)
 class Part(Generic[T]):
-    """A part of a fit, had by `reuse`.
+    """A part of a fit, as `reuse` gives it.
 
     Attributes:
         value: what was fitted or loaded.
-        loaded_seconds: how long its fit took in the earlier run it comes from; None where it was fitted now.
+        loaded_seconds: of its fit in the earlier run that it comes from; None where it was fitted now.
         overhead_seconds: time spent on waiting, reading and writing, which an ordinary run would not spend.
     """
 
@@ -60,11 +60,14 @@ def reuse(
     save: Callable[[T, Path], None],
     load: Callable[[Path], T],
 ) -> Part[T]:
-    """The part `name` from the folder `cache`, fitted and kept there where it is not yet.
+    """The part `name` from the folder `cache`, fitted and written there where it is not yet.
 
-    scene_digest: see `training_digest`. key: what the part depends on besides the scene, in values that JSON has. save
-    and load: as in `Fitted.save` and `Method.load`, from a folder of its own. Of runs at the same time one fits and the
-    others wait.
+    Of runs at the same time one fits and the others wait.
+
+    Args:
+        scene_digest: see `training_digest`.
+        key: what the part depends on besides the scene, in values that JSON has.
+        save, load: as in `Fitted.save` and `Method.load`, with a folder of its own.
     """
     start = time.perf_counter()
     dependencies = {"splashbench": __version__, "scene": scene_digest, **key}

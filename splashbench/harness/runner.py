@@ -1,7 +1,7 @@
 """Running a method on a scene: Scene -> Submission, whatever happens to the method on the way.
 
-Two child processes, fit then render; the scene they see holds no test image. The submission is written whole in
-every case: with renders when the run is `ok`, else with a status and a reason.
+Two child processes fit, then render; the copy of the scene that they see holds no test image. The submission is
+complete in every case: with renders when the run is `ok`, else with a status and a reason.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def run_method(
         timing_frames: renders to time for frames per second; 0 leaves it out.
         keep_model: keep the fitted model under OUT/model, so that it can be rendered again.
         exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
-        cache: a folder for what the runs of one study share (adapter/reuse.py); the record says what came from there.
+        cache: a folder for what the runs of one study share (reuse.py); the record says what came from there.
         withheld: timesteps that the method does not see; they are rendered and scored (submission/withheld.py).
         oracle_geometry: for the control `oracle` alone, see `write_oracle`.
 
@@ -79,8 +79,8 @@ def run_method(
         return write_oracle(scene, out, geometry=oracle_geometry, replace=replace)
     method = load_method(name)
     if device not in method.devices:
-        known = ", ".join(method.devices)
-        raise SplashbenchError(f"method {method.id} runs on {known}, not on {device!r}; leave --device out")
+        devices = ", ".join(method.devices)
+        raise SplashbenchError(f"method {method.id} runs on {devices}, not on {device!r}; leave --device out")
     preset = preset or next(iter(method.Config.presets))
     config = method.Config.preset(preset, overrides)
     identity = _identity(
@@ -109,8 +109,8 @@ def run_method(
                 seed=seed,
                 device=device,
                 budget_seconds=timeout_seconds,
-                scratch=str(_made(Path(scratch, "scratch"))),
-                model=str(_made(staging / "model")),
+                scratch=str(_folder(Path(scratch, "scratch"))),
+                model=str(_folder(staging / "model")),
                 output=str(staging),
                 result=str(Path(scratch, "outcome.json")),
                 progress=str(Path(scratch, "progress")),
@@ -127,7 +127,7 @@ def run_method(
 
 
 def _identity(method: Method, **run: Any) -> Identity:
-    """What the submission will say of itself; whatever cannot be written is found before hours go into a fit."""
+    """The submission's identity. What cannot be written raises SplashbenchError before hours go into a fit."""
     try:
         identity = Identity(
             method=method.id,
@@ -142,15 +142,15 @@ def _identity(method: Method, **run: Any) -> Identity:
     except ValidationError as error:
         first = error.errors()[0]
         raise SplashbenchError(
-            f"method {method.id!r}: {first['loc'][0]}: {first['msg']}; mend it in {type(method).__name__}"
+            f"method {method.id!r}: {first['loc'][0]}: {first['msg']}; fix it in {type(method).__name__}"
         ) from None
     except TypeError as error:
-        raise SplashbenchError(f"method {method.id!r}: TOML cannot say its settings ({error}); mend them") from None
+        raise SplashbenchError(f"method {method.id!r}: TOML cannot say its settings ({error}); change them") from None
     return identity
 
 
 def require_unchanged(scene: Scene, method: str) -> None:
-    """Raise SplashbenchError where `scene` is no longer what it was: a method's view of it is links."""
+    """Raise SplashbenchError where `scene` is no longer what it was: a method's copy of it is links."""
     try:
         same = Scene.open(scene.directory).digest == scene.digest
     except SplashbenchError:
@@ -208,7 +208,7 @@ def particles_per_frame(staging: Path) -> float | None:
 
 
 def run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Watched]:
-    """Carry out `request` in a child process; what it did not live to say is told from how it ended."""
+    """Carry out `request` in a child process. Where it left no outcome, its exit code and log give one."""
     path, result, progress = scratch / "request.json", Path(request.result), Path(request.progress)
     for stale in (result, progress):
         stale.unlink(missing_ok=True)
@@ -259,7 +259,7 @@ def drop_unwanted(staging: Path, status: Status, keep_model: bool) -> None:
             (staging / name).unlink(missing_ok=True)
 
 
-def _made(path: Path) -> Path:
+def _folder(path: Path) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     return path
 

@@ -1,8 +1,8 @@
 """The copy of a scene that a method's process is given: no test image, no test mask and no true particle is in it.
 
-It is in the released layout, whatever the scene's own. Files of that layout are linked; NeuroFluid's are written
-anew, since there one file holds colours and mask. Poses, sizes and times of test views are there, since a method
-renders them. Timesteps may be withheld, too, to see how a method interpolates: the copy is then of the others alone.
+It is in the released layout, whatever the scene's own. Files of that layout are linked; NeuroFluid's are written anew,
+since there one file holds colours and mask. Poses, sizes and times of test views are there, since a method renders
+them. Where timesteps are withheld, to see how a method interpolates, the copy is of the others alone.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def make_training_copy(scene: Scene, directory: Path, kept: Sequence[int] | None
 
 
 def _shown_meta(scene: Scene, kept: Sequence[int]) -> SceneMeta:
-    """What a method is told of `scene` on the timesteps `kept`: nothing of where it came from."""
+    """scene.json for a method, on the timesteps `kept`: nothing of where the scene came from."""
     meta = scene.meta or SceneMeta(name=plain_name(scene.name))
     if meta.container_mesh is not None:
         # Under a name of its own: synthetic scenes keep it beside the truth, which a method is not shown.

@@ -1,4 +1,4 @@
-"""What a submission says of itself: submission.toml (identity) and record.json (the harness's measurements)."""
+"""What a submission states of itself: submission.toml (identity) and record.json (the harness's measurements)."""
 
 from __future__ import annotations
 

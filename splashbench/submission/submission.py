@@ -1,4 +1,4 @@
-"""A submission on disk: what a method hands in, written whole, read only when its digests hold.
+"""A submission on disk: what a method hands in, written completely, read only when its digests are right.
 
 submission.toml             identity
 record.json                 status and costs, by the harness
@@ -129,7 +129,7 @@ class Submission:
 
 
 def integrity_faults(directory: Path) -> list[str]:
-    """What speaks against the bytes: a line for every file changed, missing, added, or not a plain file."""
+    """A line for every file that was changed, is missing, was added, or is no plain file."""
     directory = Path(directory)
     path = directory / SUMS
     if not path.is_file():
@@ -171,12 +171,12 @@ def check_submission(directory: Path, scene: Scene | None = None) -> list[str]:
     instants: dict[str, int] = {}
     for name, read in (("particles.npz", submission.particles), ("geometry.npz", submission.geometry)):
         try:
-            held = read()
+            arrays = read()
         except SplashbenchError as error:
             faults.append(str(error))
             continue
-        if held is not None:
-            instants[name] = held.n_frames
+        if arrays is not None:
+            instants[name] = arrays.n_frames
     if scene is None or submission.status != Status.OK:
         return faults
     if submission.identity.scene_digest != scene.digest:

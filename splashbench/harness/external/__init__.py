@@ -1,1 +1,1 @@
-"""Somebody else's code, run by its own commands in its own environment: Scene -> Submission."""
+"""External codes, run by their own commands in their own environments: Scene -> Submission."""

@@ -1,4 +1,4 @@
-"""Taking over what a stranger's code rendered: every file is looked at, decoded, and written anew into the submission.
+"""Collecting what an external code rendered: every file is checked, decoded, and written anew into the submission.
 
 The folder that the code was given holds renders/<cam>/<frame>.png, alpha/<cam>/<frame>.png, and where it has them
 particles.npz and geometry.npz, as in docs/submission_format.md.
@@ -22,18 +22,18 @@ T = TypeVar("T")
 
 
 def collect(into: Path, staging: Path, scene: Scene) -> None:
-    """Check the hand-in in `into` and write it into `staging`. Raises Failure with the status that its fault has."""
-    wanted = [(name, t) for name in scene.test for t in range(scene.n_frames)]
+    """Check what the code left in `into` and write it into `staging`. Raises Failure with the fault's status."""
+    views = [(name, t) for name in scene.test for t in range(scene.n_frames)]
     missing = [
         path.relative_to(into).as_posix()
-        for name, t in wanted
+        for name, t in views
         for kind in ("renders", "alpha")
         if not (path := render_path(into, kind, name, t)).is_file()
     ]
     if missing:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         raise Failure(Status.INCOMPLETE, f"{missing[0]} is missing{more}")
-    for name, t in track(wanted, "taking over the renders"):
+    for name, t in track(views, "taking over the renders"):
         camera = scene.cameras[name]
         rgb, alpha = (render_path(into, kind, name, t) for kind in ("renders", "alpha"))
         for path in (rgb, alpha):
@@ -56,10 +56,10 @@ def _collect_array_file(
     if not path.exists() and not path.is_symlink():
         return
     _require_plain(path, path.parent)
-    held = _read(load, path, path.parent)
-    if held.n_frames != scene.n_frames:
-        raise Failure(Status.INCOMPLETE, f"{path.name} has {held.n_frames} instants, the scene {scene.n_frames}")
-    held.save(staging / path.name)
+    arrays = _read(load, path, path.parent)
+    if arrays.n_frames != scene.n_frames:
+        raise Failure(Status.INCOMPLETE, f"{path.name} has {arrays.n_frames} instants, the scene {scene.n_frames}")
+    arrays.save(staging / path.name)
 
 
 def _require_plain(path: Path, into: Path) -> None:

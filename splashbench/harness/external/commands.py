@@ -1,4 +1,4 @@
-"""Commands of a stranger's code as a user types them, with placeholders such as {scene} for what the harness knows."""
+"""Commands of an external code as a user types them, with placeholders such as {scene} for what the harness knows."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def require_command(option: str, text: str, shell: bool, directory: Path) -> Non
     """Raise SplashbenchError where the command `text`, given as `option`, cannot be run: before any work."""
     unknown = [name for name in _PLACEHOLDER.findall(text) if name and name not in PLACEHOLDERS]
     if unknown:
-        known = ", ".join(f"{{{name}}}" for name in PLACEHOLDERS)
-        raise SplashbenchError(f"{option}: there is no placeholder {{{unknown[0]}}}; there are {known}")
+        placeholders = ", ".join(f"{{{name}}}" for name in PLACEHOLDERS)
+        raise SplashbenchError(f"{option}: there is no placeholder {{{unknown[0]}}}; there are {placeholders}")
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise SplashbenchError(f"{option}: {text!r} cannot be split into words ({error}); mend its quotes") from None
+        raise SplashbenchError(f"{option}: {text!r} cannot be split into words ({error}); fix its quotes") from None
     if not words:
         raise SplashbenchError(f"{option} is empty; give the program and its arguments")
     if shell or _PLACEHOLDER.search(words[0]):

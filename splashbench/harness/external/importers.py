@@ -1,7 +1,7 @@
-"""Importers: what a stranger's code wrote, read as a fitted model that the harness renders, times and checks itself.
+"""Importers: what an external code wrote, read as a fitted model that the harness renders, times and checks itself.
 
-An importer for a code knows its files, and has the code's primitives and their renderer in Python; it is registered
-under the entry-point group `splashbench.importers`, or given as FILE.py:CLASS. docs/external_methods.md has an example.
+An importer knows the files of one code, and has its primitives and their renderer in Python. It is registered under the
+entry-point group `splashbench.importers`, or given as FILE.py:CLASS. docs/external_methods.md has an example.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ GROUP = "splashbench.importers"
 
 
 class Importer(ABC):
-    """Reads the output of one code. Files come from a stranger: no pickles, torch.load with weights_only=True."""
+    """Reads the output of one code. Files come from elsewhere: no pickles, torch.load with weights_only=True."""
 
     id: ClassVar[str]
     title: ClassVar[str]
@@ -50,20 +50,20 @@ def registered_importers() -> list[str]:
 def load_importer(name: str) -> Importer:
     """The importer registered as `name`, or `FILE.py:CLASS`. Raises SplashbenchError when there is none."""
     if ":" in name:
-        found = class_from_file(name)
+        importer = class_from_file(name)
     else:
         points = {point.name: point for point in entry_points(group=GROUP)}
         if name not in points:
-            known = ", ".join(sorted(points)) or "none"
+            installed = ", ".join(sorted(points)) or "none"
             raise SplashbenchError(
-                f"there is no importer {name!r} (installed: {known}); give --render-command, or an importer as "
+                f"there is no importer {name!r} (installed: {installed}); give --render-command, or an importer as "
                 "FILE.py:CLASS (docs/external_methods.md)"
             )
-        found = load_point(points[name])
-    if not (isinstance(found, type) and issubclass(found, Importer)):
+        importer = load_point(points[name])
+    if not (isinstance(importer, type) and issubclass(importer, Importer)):
         raise SplashbenchError(f"{name!r} is not a splashbench.harness.external.importers.Importer; subclass it")
-    missing = sorted(getattr(found, "__abstractmethods__", ()))
-    missing += [attribute for attribute in ("id", "title", "formats") if not hasattr(found, attribute)]
+    missing = sorted(getattr(importer, "__abstractmethods__", ()))
+    missing += [attribute for attribute in ("id", "title", "formats") if not hasattr(importer, attribute)]
     if missing:
         raise SplashbenchError(f"importer {name!r} lacks {', '.join(missing)}; see docs/external_methods.md")
-    return found()
+    return importer()

@@ -1,6 +1,6 @@
-"""The steps of running a stranger's code: export, fit, then renders by its own command or by an importer.
+"""The phases of running an external code: export, fit, then renders by its own command or by an importer.
 
-Each step adds what it measured to the record, or raises Failure with the status that the code's fault has.
+Each phase adds what it measured to the record, or raises Failure with the status that the code's fault has.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class ExternalCode:
         name, version, mixed: what the submission says of the method (docs/submission_format.md).
         format: of the export it trains on, one of scene.export.FORMATS.
         command: fits the scene; placeholders are those of commands.PLACEHOLDERS. "" with `trained`.
-        trained: a folder that the command left as `{out}` on an earlier day, for an importer or `render_command` to
-            read; the fit is then not measured. None where `command` is run.
+        trained: a folder that the command left as `{out}` earlier, for an importer or `render_command` to read. The
+            fit is then not measured. None where `command` is run.
         render_command: writes the test views; None where `command` does, or where an importer reads its output.
         importer: an importer's name, or None.
         shell: whether the commands are for /bin/sh, with pipes and variables, rather than a program and arguments.
@@ -192,7 +192,7 @@ class ExternalRun:
             progress=progress,
             label=f"{self.code.name[:24]}: {phase}",
             timeout_seconds=self.timeout_seconds,
-            tell_log=True,
+            show_log=True,
         )
         self._watched(watched)
         if watched.timed_out:

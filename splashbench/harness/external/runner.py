@@ -1,8 +1,8 @@
-"""Running a stranger's code on a scene by its own commands: Scene -> Submission, in the code's own environment.
+"""Running an external code on a scene by its own commands: Scene -> Submission, in the code's own environment.
 
-The scene is exported as the code reads it, without any test image. The fit command is clocked and its memory measured;
-then the test views come from a render command, from the fit command itself, or from an importer of the code's output
-(importers.py). As with methods, the submission is written whole in every case: with renders, or a status and a reason.
+The scene is exported as the code reads it, without any test image. Time and memory of the fit command are measured.
+Then the test views come from a render command, from the fit command itself, or from an importer of the code's output
+(importers.py). As with methods, the submission is complete in every case: with renders, or a status and a reason.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def run_external(
                 run.take_over(keep_model)
             record = run.record
         except Failure as failure:
-            told = {"status": failure.status, "reason": failure.reason, "log_tail": run.log_tail}
-            record = run.record.model_copy(update=told)
+            fault = {"status": failure.status, "reason": failure.reason, "log_tail": run.log_tail}
+            record = run.record.model_copy(update=fault)
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, code.name)
         seal(staging, identity, record)
@@ -108,9 +108,9 @@ def _require_runnable(code: ExternalCode) -> None:
     if code.importer:
         importer = load_importer(code.importer)
         if code.format not in importer.formats:
-            known = ", ".join(importer.formats)
+            formats = ", ".join(importer.formats)
             raise SplashbenchError(
-                f"importer {importer.id} reads what was trained on {known}, not on {code.format}; change --format"
+                f"importer {importer.id} reads what was trained on {formats}, not on {code.format}; change --format"
             )
 
 
@@ -157,7 +157,7 @@ def _require_apart(work: Path, *others: Path) -> None:
 def _workplace(work: Path | None) -> Iterator[Path]:
     """A folder for everything on the way; `work` stays, a temporary one goes."""
     if work is None:
-        # What a stranger made in it may resist; that must not cost the run.
+        # What the code left in it may resist removal; that must not cost the run.
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
             yield Path(scratch).resolve()
         return
