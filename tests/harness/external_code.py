@@ -1,4 +1,4 @@
-"""A stranger's code, as tests run it by commands: `fit` and `render`, well-behaved and otherwise."""
+"""An external code, as tests run it by commands: `fit` and `render`, well-behaved and otherwise."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A stranger's code, run by commands: whatever it does there is a whole submission with a status, or none at all."""
+"""An external code, run by commands: whatever it does there is a complete submission with a status, or none."""
 
 import functools
 import json
@@ -65,9 +65,9 @@ def test_a_good_code_is_measured_checked_and_scored(
     arguments += ["--command", _fit("good", "{seed}", "{device}", "{frames}", "{seconds}", "a b"), "--mixed", "--json"]
     arguments += ["--render-command", _render("good"), "--seed", "4", "--device", "cuda:1", "--points", str(POINTS)]
     assert main(arguments) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["method"], told["status"], told["seed"], told["device"]) == ("theirs", "ok", 4, "cuda:1")
-    assert told["settings"]["format"] == "blender"
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["method"], summary["status"], summary["seed"], summary["device"]) == ("theirs", "ok", 4, "cuda:1")
+    assert summary["settings"]["format"] == "blender"
     assert check_submission(out, balls) == []
     submission = Submission.open(out)
     assert submission.identity.mixed

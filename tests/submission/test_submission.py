@@ -78,7 +78,7 @@ def test_a_folder_that_is_no_submission_is_told(tmp_path: Path) -> None:
     assert "no submission" in check_submission(tmp_path)[0]
 
 
-def test_identity_from_a_stranger_is_validated(copy: Path) -> None:
+def test_an_identity_from_elsewhere_is_validated(copy: Path) -> None:
     path = copy / "submission.toml"
     path.write_text(path.read_text().replace('method = "oracle"', 'method = "../../etc"'))
     with pytest.raises(SplashbenchError, match=r"submission.toml: method"):

@@ -74,10 +74,10 @@ def test_progress_that_tells_nothing(name: str, said: str) -> None:
     ],
 )
 def test_models_that_are_not_what_they_seem(name: str, failed: dict[str, str]) -> None:
-    found = verdicts(tried(name, RENDERING), Verdict.FAILED)
-    assert set(found) == set(failed)
+    details = verdicts(tried(name, RENDERING), Verdict.FAILED)
+    assert set(details) == set(failed)
     for check, said in failed.items():
-        assert said in found[check]
+        assert said in details[check]
 
 
 @pytest.mark.parametrize(
@@ -100,10 +100,10 @@ def test_models_that_are_not_what_they_seem(name: str, failed: dict[str, str]) -
 )
 def test_fits_that_use_what_they_may_not(name: str, only: list[str], failed: dict[str, str]) -> None:
     report = tried(name, only)
-    found = verdicts(report, Verdict.FAILED)
-    assert set(found) == set(failed)
+    details = verdicts(report, Verdict.FAILED)
+    assert set(details) == set(failed)
     for check, said in failed.items():
-        assert said in found[check]
+        assert said in details[check]
     # With fits that differ by chance nothing can be told from the one that could read test views.
     undecided = {"hidden_test_views"} if name == "Unseeded" else set()
     assert set(verdicts(report, Verdict.NOT_TESTED)) == undecided
@@ -117,9 +117,9 @@ def test_fits_that_use_what_they_may_not(name: str, only: list[str], failed: dic
     ],
 )
 def test_geometry_that_is_not_whole(name: str, failed: str, said: str) -> None:
-    found = verdicts(tried(name, ["views", "particles", "signed_distance"]), Verdict.FAILED)
-    assert set(found) == {failed}
-    assert said in found[failed]
+    details = verdicts(tried(name, ["views", "particles", "signed_distance"]), Verdict.FAILED)
+    assert set(details) == {failed}
+    assert said in details[failed]
 
 
 def test_a_seed_that_is_refused() -> None:
@@ -159,10 +159,10 @@ def test_a_process_left_behind_is_found_and_ended() -> None:
 def test_scenes_that_it_cannot_take(name: str, failed: dict[str, str], ok: dict[str, str]) -> None:
     report = tried(name, ["one_frame", "no_liquid"])
     for verdict, expected in ((Verdict.FAILED, failed), (Verdict.OK, ok)):
-        found = verdicts(report, verdict)
-        assert set(found) == set(expected)
+        details = verdicts(report, verdict)
+        assert set(details) == set(expected)
         for check, said in expected.items():
-            assert said in found[check]
+            assert said in details[check]
 
 
 def test_what_cannot_be_told_is_not_called_ok() -> None:

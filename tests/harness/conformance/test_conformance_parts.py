@@ -1,4 +1,4 @@
-"""Parts of the conformance test: pickles told from arrays, openings seen, and what a stopped run must not leave."""
+"""Parts of the conformance test: pickles and arrays, openings, and what a stopped run must not leave."""
 
 import pickle
 import signal
