@@ -1,12 +1,14 @@
 """Files: whole or not at all, and nothing from strangers is trusted."""
 
 import errno
+import hashlib
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from splashbench import toml
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import (
     atomic_directory,
@@ -15,6 +17,8 @@ from splashbench.files import (
     read_image,
     read_json,
     read_npz,
+    sha256_file,
+    tree_bytes,
     write_image,
     write_json,
     write_png,
@@ -134,3 +138,40 @@ def test_a_zip_bomb_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("splashbench.files.arrays.MAX_NPZ_BYTES", 1000)
     with pytest.raises(SplashbenchError, match="unpacks to more than"):
         read_npz(path, {"a": 1})
+
+
+def test_a_file_of_text_larger_than_its_limit_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, module, load in (
+        ("a.json", "files.documents.MAX_JSON_BYTES", read_json),
+        ("a.toml", "toml._MAX_BYTES", toml.load),
+    ):
+        monkeypatch.setattr(f"splashbench.{module}", 1 << 20)
+        (tmp_path / name).write_text(" " * ((1 << 20) + 1))
+        with pytest.raises(SplashbenchError, match=rf"{name} is larger than 1 MiB"):
+            load(tmp_path / name)
+
+
+def test_a_failed_write_removes_the_folder_it_made(tmp_path: Path) -> None:
+    with pytest.raises(ValueError), atomic_path(tmp_path / "new" / "a.json"):
+        raise ValueError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_never_takes_the_place_of_its_input(tmp_path: Path) -> None:
+    (tmp_path / "scene" / "ims").mkdir(parents=True)
+    with (
+        pytest.raises(SplashbenchError, match="holds the input"),
+        atomic_directory(tmp_path / "scene", replace=True, inputs=[tmp_path / "scene" / "ims"]),
+    ):
+        pass
+    assert (tmp_path / "scene" / "ims").is_dir()
+
+
+def test_the_size_of_a_folder_leaves_links_out(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "file").write_bytes(bytes(1000))
+    (tmp_path / "file").write_bytes(bytes(24))
+    (tmp_path / "link").symlink_to(tmp_path / "below" / "file")
+    assert tree_bytes(tmp_path) == 1024
+    assert tree_bytes(tmp_path / "nowhere") == 0
+    assert sha256_file(tmp_path / "file") == hashlib.sha256(bytes(24)).hexdigest()

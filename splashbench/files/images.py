@@ -59,8 +59,8 @@ def _checked(path: Path) -> Iterator[tuple[BinaryIO, tuple[int, int], str]]:
     with stream:
         try:
             with warnings.catch_warnings():
-                # The limit below is lower than Pillow's; one line says so.
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                # Of many pixels, for which the limit below is lower, and of EXIF, which is not used.
+                warnings.simplefilter("ignore")
                 image = Image.open(stream, formats=_FORMATS)
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError, ValueError) as error:
             raise SplashbenchError(f"{path} is not a readable image ({error}); restore the file") from None
@@ -81,8 +81,7 @@ def _read_pixels(path: Path, mode: str) -> NDArray[np.uint8]:
             raise SplashbenchError(f"{path} has no alpha channel (it is {file_mode}); restore the RGBA file")
         try:
             with warnings.catch_warnings():
-                # imageio looks at EXIF, of which nothing is used here; a damaged block is no reason to complain.
-                warnings.simplefilter("ignore")
+                warnings.simplefilter("ignore")  # of EXIF again
                 # An animated PNG is its first image.
                 return iio.imread(stream, plugin="pillow", index=0, mode=mode, writeable_output=False)
         except Exception as error:  # Pillow lets whatever a broken EXIF block causes through

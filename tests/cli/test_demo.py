@@ -1,0 +1,83 @@
+"""`splashbench demo`: what it skips, what it removes, and when it has passed; the steps themselves are commands."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from splashbench.cli import demo
+from splashbench.errors import SplashbenchError
+
+
+class _Parser:
+    """Stands in for the command line: notes each command, makes the file it names, and ends with `status`."""
+
+    def __init__(self) -> None:
+        self.commands: list[list[str]] = []
+        self.status = 0
+
+    def parse_args(self, words: list[str]) -> argparse.Namespace:
+        self.commands.append(words)
+        Path(words[-1]).write_text("output")
+        return argparse.Namespace(handler=lambda _: self.status)
+
+
+@pytest.fixture
+def parser(monkeypatch: pytest.MonkeyPatch) -> _Parser:
+    stand_in = _Parser()
+    monkeypatch.setattr("splashbench.cli.main.build_parser", lambda: stand_in)
+    return stand_in
+
+
+def test_what_exists_is_skipped_until_a_step_runs(
+    tmp_path: Path, parser: _Parser, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, third, stale = (tmp_path / name for name in ("1", "2", "3", "stale"))
+    for path in (first, third):
+        path.write_text("before")
+    stale.mkdir()
+    steps = demo._Steps(fresh=False)
+    steps.run("film", first, ["film", str(first)])
+    steps.run("prepare", second, ["prepare", str(second)])
+    steps.run("score", third, ["score", str(third)], stale=(stale,))
+    assert [words[0] for words in parser.commands] == ["prepare", "score"]
+    assert [path.read_text() for path in (first, second, third)] == ["before", "output", "output"]
+    assert not stale.exists()
+    assert f"[1] film: skipped, {first} exists" in capsys.readouterr().err
+
+
+def test_fresh_repeats_every_step(tmp_path: Path, parser: _Parser) -> None:
+    (tmp_path / "1").write_text("before")
+    demo._Steps(fresh=True).run("film", tmp_path / "1", ["film", str(tmp_path / "1")])
+    assert [words[0] for words in parser.commands] == ["film"]
+
+
+def test_a_step_that_fails_ends_the_demo(tmp_path: Path, parser: _Parser) -> None:
+    parser.status = 1
+    with pytest.raises(SplashbenchError, match=r"the demo stopped at: splashbench film .*; see the lines above"):
+        demo._Steps(fresh=False).run("film", tmp_path / "1", ["film", str(tmp_path / "1")])
+
+
+@pytest.mark.parametrize(
+    ("value", "at_most", "passed"),
+    [
+        *[(0.9, True, True), (1.0, True, True), (1.1, True, False)],
+        *[(0.9, False, False), (1.0, False, True), (1.1, False, True)],
+        *[(None, True, False), (None, False, False)],
+    ],
+)
+def test_a_gate_passes_on_its_side_of_the_limit(value: float | None, at_most: bool, passed: bool) -> None:
+    gate = demo._Gate("error", value, 1.0, at_most)
+    assert gate.passed is passed
+    assert gate.row()[-1] == ("pass" if passed else "FAIL")
+
+
+def test_a_folder_becomes_the_demos_only_where_it_is_empty(tmp_path: Path) -> None:
+    demo._claim(tmp_path / "out")
+    demo._claim(tmp_path / "out")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "holiday.jpg").write_bytes(b"dear")
+    with pytest.raises(SplashbenchError, match="holds files that are not the demo's"):
+        demo._claim(tmp_path / "photos")
