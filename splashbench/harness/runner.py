@@ -20,8 +20,8 @@ from splashbench.harness import hardware, method_process
 from splashbench.harness.contract import Method
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.messages import Outcome, Request
-from splashbench.harness.process import Watched, watch
 from splashbench.harness.training_copy import make_training_copy
+from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
 from splashbench.submission.withheld import Withheld, kept_timesteps

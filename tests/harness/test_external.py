@@ -161,6 +161,14 @@ def test_what_is_handed_in_is_not_trusted(
     assert stop.value.reason.startswith(reason)
 
 
+def test_a_code_that_changes_the_scene_is_refused(balls_copy: Path, tmp_path: Path) -> None:
+    image = balls_copy / "ims" / "1" / "000000.png"
+    spoil = shlex.join([sys.executable, "-c", f"open({str(image)!r}, 'ab').write(b' ')"])
+    with pytest.raises(SplashbenchError, match="was changed while theirs ran"):
+        run_external(ExternalCode("theirs", spoil, "blender", points=0), balls_copy, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_failure_is_exit_1_and_keeps_the_last_lines(
     balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,7 +18,7 @@ from splashbench.harness.conformance import subject
 from splashbench.harness.conformance.recording import OpeningWatch, Touch, read_touches
 from splashbench.harness.conformance.scene_copies import SceneCopy
 from splashbench.harness.conformance.subject import Answer, Order, Subject
-from splashbench.harness.process import Watched, watch
+from splashbench.harness.watched_process import Watched, watch
 
 #: Every process of a test inherits this variable, with a value of its own: what is left behind is found by it.
 _MARK = "SPLASHBENCH_CONFORMANCE"

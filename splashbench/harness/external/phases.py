@@ -16,9 +16,9 @@ from splashbench.files import tree_bytes
 from splashbench.harness.external.collection import collect
 from splashbench.harness.external.commands import command_line
 from splashbench.harness.messages import Failure, Request
-from splashbench.harness.process import Watched, watch
 from splashbench.harness.runner import particles_per_frame, run_phase
 from splashbench.harness.training_copy import make_training_copy
+from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Scene
 from splashbench.scene.export import TEST_VIEWS, InitialPoints, export_scene
 from splashbench.submission import Record, Status
