@@ -16,8 +16,8 @@ from splashbench.score.result import Digests, metric_value
 from splashbench.study.job import RunEntry, Store
 from splashbench.study.plan import PlannedRun, StudyPlan, make_plan
 from splashbench.study.report import runs_csv, table_csv, write_report
-from splashbench.study.spec import StudySpec
-from splashbench.study.table import Table, make_table
+from splashbench.study.spec import StudySpec, load_spec
+from splashbench.study.table import Table, _paper_figures, make_table
 from splashbench.study.table_markdown import to_markdown
 from splashbench.submission import Record
 from splashbench.synth.balls import write_balls_scene
@@ -141,6 +141,16 @@ def test_runs_that_are_not_made_leave_gaps_and_no_means(plan: StudyPlan, store: 
     assert row.cells["psnr"].seeds == (24.5, 25.0)
 
 
+def test_a_study_without_any_run_says_so_and_has_no_figures(plan: StudyPlan, tmp_path: Path) -> None:
+    table = make_table(plan, Store(tmp_path))
+    text = to_markdown(table, COMMAND)
+    assert "- Runs: 0 ok, 0 failed, 18 not run yet" in text
+    assert ": over " not in text  # which lists the scenes of a metric that some lack
+    assert "| full | 0 of 6 | – | – | – | – | – |" in text
+    assert table_csv(table).splitlines()[1] == f"full,0,0,6{20 * ','},false"
+    assert runs_csv(table).splitlines()[1].startswith(f"a,full,0,not run,{6 * ','},")
+
+
 def test_markdown_says_what_was_run_and_what_came_of_it(table: Table) -> None:
     text = to_markdown(table, COMMAND)
     for line in (
@@ -171,6 +181,23 @@ def test_the_paper_s_figures_stand_by_themselves(table: Table) -> None:
     assert "| per_frame | 20.06 |" in reported
     assert "Not measured here" in reported
     assert table.rows[1].paper == {}
+
+
+def test_the_paper_s_storage_is_given_in_bytes() -> None:
+    paper = _paper_figures(load_spec("sensitivity", scenes=["anywhere"]))
+    assert paper["full"]["dynamic_bytes"] == pytest.approx(17e6)
+
+
+def test_the_reference_s_row_holds_the_runs_on_unchanged_scenes_alone(plan: StudyPlan) -> None:
+    changed = [
+        {"name": "views", "train_views": 4},
+        {"name": "raw", "perturbation": [{"kind": "empty_masks", "share": 0.5}]},
+    ]
+    spec = plan.spec.model_dump() | {"reference": {}, "variants": [{"name": "full"}, *changed], "paper": None}
+    with_reference = make_plan(StudySpec.model_validate(spec))
+    places = [(run.scene.name, run.seed) for run in with_reference.reference_row]
+    assert places == [(scene.name, seed) for seed in spec["seeds"] for scene in plan.scenes]
+    assert len(with_reference.references) == 3 * len(places)
 
 
 def test_csv_and_json_hold_the_same_figures(table: Table, tmp_path: Path) -> None:
