@@ -51,7 +51,7 @@ def write_balls_scene(
     meta = SceneMeta(
         name="balls",
         times=times.tolist(),
-        camera_times={name: own.tolist() for name, own in exposed.items()} if delays else None,
+        camera_times={name: instants.tolist() for name, instants in exposed.items()} if delays else None,
         metres_per_unit=1.0,
         gravity=(0.0, -1.0, 0.0),
         provenance={"made_by": "splashbench.synth.balls", "seed": seed, "particle_radius": _PARTICLE_RADIUS},

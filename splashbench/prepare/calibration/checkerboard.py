@@ -87,9 +87,9 @@ class CheckerboardDetector:
             if found:
                 yield from self._refined(grey, corners, zoom)
 
-    def _refined(self, grey: NDArray[np.uint8], found: NDArray[np.float32], zoom: float) -> Iterator[BoardView]:
+    def _refined(self, grey: NDArray[np.uint8], detected: NDArray[np.float32], zoom: float) -> Iterator[BoardView]:
         """The view, with corners as exact as the full image allows; nothing where too few of them stay in place."""
-        coarse = (np.asarray(found, np.float64).reshape(self.rows, self.columns, 2) + OPENCV_PIXEL_SHIFT) / zoom
+        coarse = (np.asarray(detected, np.float64).reshape(self.rows, self.columns, 2) + OPENCV_PIXEL_SHIFT) / zoom
         spacing = _spacing(coarse).ravel()
         ordered = self._ordered(grey, coarse).reshape(-1)
         pixels = coarse.reshape(-1, 2).copy()

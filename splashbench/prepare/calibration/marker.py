@@ -77,9 +77,9 @@ class MarkerDetector:
         corners, ids, _ = self._detector.detectMarkers(grey)
         if ids is None:
             return None
-        found = np.nonzero(np.asarray(ids).ravel() == self.layout.id)[0]
-        if len(found) != 1:
+        sightings = np.nonzero(np.asarray(ids).ravel() == self.layout.id)[0]
+        if len(sightings) != 1:
             return None
         # This refinement alone in OpenCV has pixel centres at +0.5, as here.
-        pixels = np.asarray(corners[int(found[0])], np.float64).reshape(4, 2) / zoom
+        pixels = np.asarray(corners[int(sightings[0])], np.float64).reshape(4, 2) / zoom
         return BoardView(np.arange(4), self.corners, pixels)

@@ -103,9 +103,9 @@ def find_mask_sets(folder: Path) -> list[MaskSet]:
     folder = Path(folder)
     if not folder.is_dir():
         raise SplashbenchError(f"{folder} is not a folder; give a scene, or a folder of masks <camera>/<frame>.png")
-    found = _mask_set(folder)
-    if found is not None:
-        return [found]
+    single = _mask_set(folder)
+    if single is not None:
+        return [single]
     inner = [_mask_set(path) for path in sorted(folder.iterdir()) if path.is_dir()]
     sets = [mask_set for mask_set in inner if mask_set is not None]
     if not sets:

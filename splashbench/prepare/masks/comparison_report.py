@@ -147,8 +147,8 @@ def _overlay(comparison: MaskComparison, pair: MaskPair) -> NDArray[np.uint8]:
     for mask_set in (comparison.refined, comparison.raw):
         path = find_image(Path(mask_set.images) if mask_set.images else None, pair.camera, pair.frame)
         if path is not None:
-            found = read_image(path)
-            image = found if found.shape == image.shape else image
+            picture = read_image(path)
+            image = picture if picture.shape == image.shape else image
             break
     rows, columns = around_masks((raw.shape[0], raw.shape[1]), raw, refined)
     return changed(image[rows, columns], raw[rows, columns], refined[rows, columns])

@@ -78,8 +78,8 @@ def _font(size: int, bold: bool) -> Any:
     from PIL import ImageFont
 
     weight = "bold" if bold else "normal"
-    found = font_manager.findfont(font_manager.FontProperties(family="DejaVu Sans", weight=weight))
-    return ImageFont.truetype(found, size)
+    font_file = font_manager.findfont(font_manager.FontProperties(family="DejaVu Sans", weight=weight))
+    return ImageFont.truetype(font_file, size)
 
 
 def write_line(

@@ -101,7 +101,7 @@ class Sam3Masks:
             followed = follow(
                 self._checkpoint,
                 self._follower,
-                lambda wanted: self._read_frames(camera, wanted),
+                lambda frames: self._read_frames(camera, frames),
                 self._points[camera],
                 indices,
                 self._sources[camera],
@@ -131,13 +131,13 @@ class _Finder:
         """The union of the instances found, [H, W]."""
         pixels = self._checkpoint.scaled(frame, self._model.config.vision_config.image_size)
         with seeded(self._checkpoint.device):
-            found = self._model(pixel_values=pixels, **self._words)
+            output = self._model(pixel_values=pixels, **self._words)
         # An instance's score is its own times that of the concept's being in the image at all.
-        scores = found.pred_logits[0].sigmoid() * found.presence_logits[0].sigmoid()
+        scores = output.pred_logits[0].sigmoid() * output.presence_logits[0].sigmoid()
         height, width = frame.shape[:2]
         union = np.zeros((height, width), bool)
         # One by one: all at once, two hundred masks of a 4K frame are seven gigabytes.
-        for instance in found.pred_masks[0][scores > self._confidence]:
+        for instance in output.pred_masks[0][scores > self._confidence]:
             union |= _above(instance.sigmoid()[None, None], _MASK_PROBABILITY, height, width)
         return union
 

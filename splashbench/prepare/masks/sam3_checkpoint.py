@@ -154,17 +154,17 @@ class Sam3Checkpoint:
         try:
             with _quiet():
                 tokenizer = CLIPTokenizer.from_pretrained(self.folder, local_files_only=True)
-                found = tokenizer(text, return_tensors="pt", padding="max_length", max_length=length)
+                encoded = tokenizer(text, return_tensors="pt", padding="max_length", max_length=length)
         except Exception as error:  # as above
             raise SplashbenchError(
                 f"{self.folder}: the tokenizer cannot be loaded ({type(error).__name__}: {error}); copy it again"
             ) from None
-        n_tokens = found["input_ids"].shape[1]
+        n_tokens = encoded["input_ids"].shape[1]
         if n_tokens > length:
             raise SplashbenchError(
                 f"{self.folder}: reads {length} tokens, and masks.text has {n_tokens}; shorten {text!r}"
             )
-        return {name: found[name].to(self.device) for name in ("input_ids", "attention_mask")}
+        return {name: encoded[name].to(self.device) for name in ("input_ids", "attention_mask")}
 
     def scaled(self, frame: NDArray[np.uint8], size: int) -> Any:
         """A frame [H, W, 3] as the models want it: float32 [1, 3, size, size] on the device."""

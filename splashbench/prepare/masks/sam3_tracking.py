@@ -103,17 +103,17 @@ class _Memory:
         """The next frame in the direction of travel; returns its logits."""
         pixels = self._checkpoint.scaled(image, self._size)
         with seeded(self._checkpoint.device):
-            found = self._model(self._session, frame=pixels, frame_idx=position, reverse=backwards)
+            output = self._model(self._session, frame=pixels, frame_idx=position, reverse=backwards)
         self._forget(position)
-        return found.pred_masks.float()
+        return output.pred_masks.float()
 
     def _forget(self, position: int) -> None:
         """Drop what no later frame can refer to; what is near the first anchor serves both directions."""
         assert self._first is not None
         self._session.processed_frames.clear()
         outputs = self._session.output_dict_per_obj[0]
-        for kept in (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values()):
-            kept.pop("high_res_masks", None)
+        for frame_output in (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values()):
+            frame_output.pop("high_res_masks", None)
         tracked = outputs["non_cond_frame_outputs"]
         for other in list(tracked):
             if min(abs(other - position), abs(other - self._first)) > self._reach:

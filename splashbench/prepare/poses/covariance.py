@@ -68,10 +68,10 @@ def pose_sigmas(
     except linalg.LinAlgError:
         return None
     rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in chosen])
-    free, own = covariance[np.ix_(rows, rows)], generators[rows]
+    free, gauge = covariance[np.ix_(rows, rows)], generators[rows]
     weights = np.tile([1.0, 1.0, 1.0, *([1 / radius**2] * 3)], len(chosen))
     # What no similarity of the chosen cameras can take away.
-    remain = np.eye(len(rows)) - own @ np.linalg.solve(own.T @ (weights[:, None] * own), own.T * weights)
+    remain = np.eye(len(rows)) - gauge @ np.linalg.solve(gauge.T @ (weights[:, None] * gauge), gauge.T * weights)
     deviations = np.diag(remain @ free @ remain.T).reshape(-1, 2, 3).sum(-1)
     if not np.isfinite(deviations).all() or (deviations < 0).any():
         return None

@@ -67,11 +67,11 @@ def charuco_board(board: dict[str, Any]) -> Any:
     import cv2
 
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board["dictionary"]))
-    made = cv2.aruco.CharucoBoard(
+    charuco = cv2.aruco.CharucoBoard(
         (board["squares_x"], board["squares_y"]), board["square_metres"], board["marker_metres"], dictionary
     )
-    made.setLegacyPattern(board["legacy"])
-    return made
+    charuco.setLegacyPattern(board["legacy"])
+    return charuco
 
 
 def board_albedo(board: dict[str, Any], margin_squares: float = 0.35) -> Albedo:

@@ -21,7 +21,7 @@ def liquid_surface(positions: NDArray[np.float32], particle_radius: float) -> Me
 
     if not len(positions):
         return None
-    found, _ = pysplashsurf.reconstruction_pipeline(
+    reconstruction, _ = pysplashsurf.reconstruction_pipeline(
         np.ascontiguousarray(positions, np.float64),
         particle_radius=particle_radius,
         smoothing_length=SMOOTHING_LENGTH,
@@ -33,7 +33,7 @@ def liquid_surface(positions: NDArray[np.float32], particle_radius: float) -> Me
         multi_threading=False,  # the renderer's workers fill the machine already
     )
     return Mesh(
-        vertices=np.asarray(found.mesh.vertices, np.float32),
-        faces=np.asarray(found.mesh.triangles).astype(np.int32),
-        normals=np.asarray(found.point_attributes["normals"], np.float32),
+        vertices=np.asarray(reconstruction.mesh.vertices, np.float32),
+        faces=np.asarray(reconstruction.mesh.triangles).astype(np.int32),
+        normals=np.asarray(reconstruction.point_attributes["normals"], np.float32),
     )

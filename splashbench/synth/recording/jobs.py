@@ -123,13 +123,13 @@ def pour_recording(plan: RecordingPlan, name: str, trajectory: Trajectory, sessi
             yield noise.expose(shown.image)
 
     track = record(recorder.microphone, plan.sources, recorder.n_frames / recorder.fps)
-    made = frames()
+    exposed = frames()
     start = 0
     for chapter, stop in enumerate(_chapter_ends(recorder), start=1):
         samples = slice(round(start * SAMPLE_RATE / recorder.fps), round(stop * SAMPLE_RATE / recorder.fps))
         write_recording(
             session / POUR_FILE.format(name, chapter),
-            (next(made) for _ in range(start, stop)),
+            (next(exposed) for _ in range(start, stop)),
             recorder.fps,
             track[samples],
             **_stamps(recorder, start),
@@ -154,9 +154,9 @@ def _stamps(recorder: RigCamera, frame: int) -> dict[str, str]:
     """Creation time and timecode of a file, off by up to 20 ms as on synchronised action cameras."""
     rng = np.random.default_rng([*recorder.microphone.seed, 9])
     seconds = 10 * 3600 + recorder.common_time(frame) + float(rng.uniform(-0.02, 0.02))
-    whole = int(seconds)
-    clock = f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}"
-    count = int((seconds - whole) * recorder.fps)
+    full_seconds = int(seconds)
+    clock = f"{full_seconds // 3600:02d}:{full_seconds // 60 % 60:02d}:{full_seconds % 60:02d}"
+    count = int((seconds - full_seconds) * recorder.fps)
     return {"created": f"2024-05-04T{clock}Z", "timecode": f"{clock}:{count:02d}"}
 
 
