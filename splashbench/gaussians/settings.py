@@ -14,27 +14,21 @@ from splashbench.harness.contract import MethodConfig
 _LARGE = 0.01
 
 
-class SplattingSettings(MethodConfig):
-    """How a dynamic set of Gaussians is fitted. Shares are of the iterations.
+class DynamicFitSettings(MethodConfig):
+    """How a dynamic set of Gaussians, or of anchors that make Gaussians, is fitted. Shares are of the iterations.
 
     Attributes:
         iterations: steps; views_per_step: training views of one timestep in each.
         static: where the points of the static scene come from, see gaussians/initialization.py; static_points, at most.
         hull_points: points of the liquid's hull, over all frames together.
         start_opacity: of every Gaussian.
-        max_gaussians: Gaussians at most.
-        grow_from, grow_until: shares between which Gaussians are cloned and split, every `grow_every` steps.
-        grow_gradient: mean screen gradient (normalised device coordinates) above which they are.
-        prune_until: share until which faint ones are dropped.
-        reset_every: steps between opacity resets, 0 for never; reset_until: share after which there are none.
+        grow_from, grow_until: shares between which there is growth, every `grow_every` steps.
+        grow_gradient: mean screen gradient (normalised device coordinates) above which there is.
         rate_factor: times the published learning rates of where Gaussians are and how they move.
-        color_factor: times the published learning rates of colours and features.
         rates: whether every learning rate stays for a good third of the fit and has fallen to a fortieth by its last
             quarter ("short"), or as published.
         longest_side: photographs are shrunk to this many pixels.
     """
-
-    renamed: ClassVar[Mapping[str, str]] = {"most": "max_gaussians"}
 
     iterations: int = Field(default=1000, ge=1, le=1_000_000)
     views_per_step: int = Field(default=5, ge=1, le=64)
@@ -42,18 +36,32 @@ class SplattingSettings(MethodConfig):
     static_points: int = Field(default=6000, ge=10, le=5_000_000)
     hull_points: int = Field(default=4000, ge=0, le=5_000_000)
     start_opacity: float = Field(default=0.6, gt=0, lt=1)
-    max_gaussians: int = Field(default=20_000, ge=10, le=10_000_000)
     grow_from: float = Field(default=0.1, ge=0, le=1)
     grow_until: float = Field(default=0.5, ge=0, le=1)
     grow_every: int = Field(default=100, ge=1)
     grow_gradient: float = Field(default=2e-4, gt=0)
+    rate_factor: float = Field(default=1.0, gt=0, le=1000)
+    rates: Literal["short", "published"] = "short"
+    longest_side: int = Field(default=400, ge=16, le=16384)
+
+
+class SplattingSettings(DynamicFitSettings):
+    """How a dynamic set of Gaussians is fitted that are cloned, split and pruned; besides `DynamicFitSettings`:
+
+    Attributes:
+        max_gaussians: Gaussians at most.
+        prune_until: share until which faint ones are dropped.
+        reset_every: steps between opacity resets, 0 for never; reset_until: share after which there are none.
+        color_factor: times the published learning rates of colours and features.
+    """
+
+    renamed: ClassVar[Mapping[str, str]] = {"most": "max_gaussians"}
+
+    max_gaussians: int = Field(default=20_000, ge=10, le=10_000_000)
     prune_until: float = Field(default=0.5, ge=0, le=1)
     reset_every: int = Field(default=0, ge=0)
     reset_until: float = Field(default=0.6, ge=0, le=1)
-    rate_factor: float = Field(default=1.0, gt=0, le=1000)
     color_factor: float = Field(default=1.0, gt=0, le=1000)
-    rates: Literal["short", "published"] = "short"
-    longest_side: int = Field(default=400, ge=16, le=16384)
 
     def density(self, extent: float) -> DensitySettings:
         """When and where Gaussians come and go; `extent` of the cameras, scene units."""

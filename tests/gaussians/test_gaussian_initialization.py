@@ -141,7 +141,8 @@ class TestPlainViews:
     )
     def test_it_is_drawn_and_kept(self, name: str, plain: TrainingScene, balls: Scene, tmp_path: Path) -> None:
         method = load_method(name)
-        small = {"iterations": 3, "hull_points": 60, "max_gaussians": 100}
+        limit = "max_anchors" if name == "scaffold_4d" else "max_gaussians"
+        small = {"iterations": 3, "hull_points": 60, limit: 100}
         fitted = method.fit(plain, method.Config.preset("quick", small), Run(directory=tmp_path))
         camera = balls.cameras["6"]
         image = fitted.render(camera, 0.1).rgb
