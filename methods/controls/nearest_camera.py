@@ -45,8 +45,8 @@ class NearestView(Fitted):
 
     def source(self, camera: Camera) -> Camera:
         """The training camera that sees the scene's centre from the most similar direction."""
-        wanted = _direction(camera.center, self.center)
-        return max(self.scene.cameras.values(), key=lambda c: float(wanted @ _direction(c.center, self.center)))
+        direction = _direction(camera.center, self.center)
+        return max(self.scene.cameras.values(), key=lambda c: float(direction @ _direction(c.center, self.center)))
 
     def render(self, camera: Camera, time: float) -> Render:
         source = self.source(camera)

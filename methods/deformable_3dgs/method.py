@@ -90,11 +90,11 @@ class Deformable3DGS(Method):
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         path = directory / MODEL_FILE
-        found = read_npz(path, {"rest": 3, "deformation.shift.weight": 2})
-        degree = round((found["rest"].shape[1] + 1) ** 0.5) - 1
+        tables = read_npz(path, {"rest": 3, "deformation.shift.weight": 2})
+        degree = round((tables["rest"].shape[1] + 1) ** 0.5) - 1
         with np.load(path, allow_pickle=False) as archive:
             depth = sum(name.startswith("deformation.layers.") and name.endswith("weight") for name in archive.files)
-        model = DeformableModel(0, degree, depth, found["deformation.shift.weight"].shape[1])
+        model = DeformableModel(0, degree, depth, tables["deformation.shift.weight"].shape[1])
         load_tables(path, model, ROWS)
         return MixedFitted(model, scene)
 
@@ -108,5 +108,5 @@ class _TimeNoise:
         self._rng = rng
 
     def at(self, step: int) -> float:
-        left = max(0.0, 1 - step / self._until)
-        return float(self._rng.normal()) * self._sigma * left
+        remaining = max(0.0, 1 - step / self._until)
+        return float(self._rng.normal()) * self._sigma * remaining

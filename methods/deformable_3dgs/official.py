@@ -109,9 +109,9 @@ class OfficialDeformable3DGS(Importer):
 
     def load(self, directory: Path, scene: TrainingScene) -> OfficialFitted:
         path = directory / MODEL_FILE
-        found = read_npz(path, {"rest": 3}, {"deformation.times.0.weight": 2})
-        degree = round((found["rest"].shape[1] + 1) ** 0.5) - 1
-        model = OfficialDeformable(0, degree, synthetic=len(found) > 1)
+        tables = read_npz(path, {"rest": 3}, {"deformation.times.0.weight": 2})
+        degree = round((tables["rest"].shape[1] + 1) ** 0.5) - 1
+        model = OfficialDeformable(0, degree, synthetic=len(tables) > 1)
         load_tables(path, model, ROWS)
         return OfficialFitted(model, scene)
 

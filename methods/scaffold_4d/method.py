@@ -24,10 +24,12 @@ from .settings import Scaffold4DSettings
 
 def rates(settings: Scaffold4DSettings) -> dict[str, LearningRate]:
     """Learning rates by table: those of static anchors, and of the flow."""
-    found = {**RATES[settings.rates], "flow_head": LearningRate.constant(1e-3)}
+    published = {**RATES[settings.rates], "flow_head": LearningRate.constant(1e-3)}
     factor = settings.rate_factor
-    found |= {name: LearningRate(found[name].first * factor, found[name].last * factor) for name in PER_ANCHOR}
-    return found if settings.rates == "published" else {name: rate.short() for name, rate in found.items()}
+    published |= {
+        name: LearningRate(published[name].first * factor, published[name].last * factor) for name in PER_ANCHOR
+    }
+    return published if settings.rates == "published" else {name: rate.short() for name, rate in published.items()}
 
 
 class Scaffold4D(Method):

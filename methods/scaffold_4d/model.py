@@ -118,11 +118,11 @@ class SpacetimeAnchors(Anchors, DynamicModel):
         """
         model = cls(len(start), variant)
         k, static = variant.children, torch.from_numpy(start.frame < 0)
-        own = torch.from_numpy(np.asarray(times, np.float32))[torch.from_numpy(start.frame.clip(min=0))]
+        point_times = torch.from_numpy(np.asarray(times, np.float32))[torch.from_numpy(start.frame.clip(min=0))]
         model.backdrop = start.backdrop_tensor()
         with torch.no_grad():
             model.positions[:, :3] = torch.from_numpy(start.positions)
-            model.positions[:, 3] = torch.where(static, 0.5, own)
+            model.positions[:, 3] = torch.where(static, 0.5, point_times)
             model.unit.fill_(float(np.median(start.spacing)))
             model.features.normal_(std=0.1)
             if variant.base_color:

@@ -101,8 +101,10 @@ def published_footprints(means: Tensor, factors: Tensor, camera: Camera) -> Tens
     slopes = torch.minimum(torch.maximum(slopes, (-margin - middle) / focal), (size + margin - middle) / focal)
     # J = diag(f) [I, -slope] / z on our side, and the shortest vectors that it takes to the published projections.
     sides = torch.cat([torch.eye(2).expand(len(means), 2, 2), -slopes[:, :, None]], dim=2)
-    wanted = _published_projection(camera) / focal[:, None]
-    across = sides.transpose(1, 2) @ torch.linalg.solve(sides @ sides.transpose(1, 2), wanted.expand(len(means), 2, 3))
+    published = _published_projection(camera) / focal[:, None]
+    across = sides.transpose(1, 2) @ torch.linalg.solve(
+        sides @ sides.transpose(1, 2), published.expand(len(means), 2, 3)
+    )
     return rotation.T @ across @ rotation @ factors
 
 
@@ -142,8 +144,8 @@ class OfficialScaffold4D(Importer):
         flow = 1.0 if arguments.flag("use_flow") else 0.0
         model = _anchors(read_point_cloud(path), arguments.number("hparam_beta", 4.0), flow)
         model.squared.fill_(fading != "ours")
-        for name, own in _HEADS.items():
-            head = getattr(model, own)
+        for name, attribute in _HEADS.items():
+            head = getattr(model, attribute)
             slots = {f"{i}.{kind}": getattr(head[i], kind) for i in (0, 2) for kind in ("weight", "bias")}
             weights = path.with_name(f"{name}.pt")
             fill(slots, read_weights(weights), weights)

@@ -146,7 +146,7 @@ def supervised_anchors(model: AnchorModel, plates: list[CleanPlate]) -> AnchorMo
         assert color.grad is not None
         weight += color.grad.view(len(model), -1).sum(dim=1)
     keep = torch.nonzero(weight >= _MIN_PIXELS)[:, 0]
-    kept = AnchorModel(len(keep), model.variant)
+    supervised = AnchorModel(len(keep), model.variant)
     rows = {"positions", *PER_ANCHOR}
-    kept.load_state_dict({name: t[keep] if name in rows else t for name, t in model.state_dict().items()})
-    return kept
+    supervised.load_state_dict({name: t[keep] if name in rows else t for name, t in model.state_dict().items()})
+    return supervised

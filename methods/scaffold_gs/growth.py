@@ -88,7 +88,7 @@ class AnchorGrowth(ABC):
         if dull.all() and not len(cells.centers):
             dull[np.argmax(self._opacity)] = False  # a model of no anchors could not be fitted further
         self._forget(judged)
-        kept = np.flatnonzero(~dull)
+        remaining = np.flatnonzero(~dull)
         k, dimensions = self.anchors.offsets.shape[1:]
         n, parents = len(cells.centers), torch.from_numpy(cells.chosen // k)
         new = {
@@ -96,10 +96,10 @@ class AnchorGrowth(ABC):
             "offsets": random_offsets(n, k, dimensions),
             "log_scales": self._log_scales(parents, cells.sizes),
         }
-        self.optimizer.replace_anchors(kept, torch.from_numpy(cells.centers.astype(np.float32)), new)
+        self.optimizer.replace_anchors(remaining, torch.from_numpy(cells.centers.astype(np.float32)), new)
         for name in ("_gradient", "_child_visits", "_opacity", "_visits"):
             old = getattr(self, name)
-            setattr(self, name, np.concatenate([old[kept], np.zeros((n, *old.shape[1:]), old.dtype)]))
+            setattr(self, name, np.concatenate([old[remaining], np.zeros((n, *old.shape[1:]), old.dtype)]))
 
     def _enough(self) -> NDArray[np.bool_]:
         """bool [N, K]: the children whose mean gradient counts."""

@@ -71,13 +71,13 @@ class SpacetimeModel(DynamicModel):
         """A model about to be fitted; times: [frames] in [0, 1]. Static points last all the recording long."""
         model = cls(len(start), full)
         colors, static = torch.from_numpy(start.colors), torch.from_numpy(start.frame < 0)
-        own = torch.from_numpy(np.asarray(times, np.float32))[torch.from_numpy(start.frame.clip(min=0))]
+        point_times = torch.from_numpy(np.asarray(times, np.float32))[torch.from_numpy(start.frame.clip(min=0))]
         model.backdrop = start.backdrop_tensor()
         with torch.no_grad():
             model.positions.copy_(torch.from_numpy(start.positions))
             model.log_scales.copy_(torch.from_numpy(start.spacing).log()[:, None].expand(-1, 3))
             model.opacity_logits.fill_(float(torch.logit(torch.tensor(opacity))))
-            model.times.copy_(torch.where(static, 0.5, own))
+            model.times.copy_(torch.where(static, 0.5, point_times))
             model.log_widths.copy_(torch.where(static, 0.0, log_width))
             model.base.copy_(torch.logit(colors.clamp(0.01, 0.99)) if full else colors)
             if full:
@@ -148,7 +148,7 @@ def rays(camera: Camera) -> np.ndarray:
     v = (np.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     directions = (v[:, None] * down + forward)[:, None] + u[None, :, None] * right
     lengths = np.sqrt(np.square(v)[:, None] + np.square(u) + 1)[..., None]
-    found = np.empty((camera.height, camera.width, 6), np.float32)
-    found[..., :3] = camera.center
-    np.divide(directions, lengths, out=found[..., 3:], casting="same_kind")
-    return found
+    table = np.empty((camera.height, camera.width, 6), np.float32)
+    table[..., :3] = camera.center
+    np.divide(directions, lengths, out=table[..., 3:], casting="same_kind")
+    return table

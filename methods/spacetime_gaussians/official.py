@@ -102,8 +102,8 @@ class OfficialSpacetimeGaussians(Importer):
         if model.full:
             decoder = arguments.text("rgbfunction")
             if decoder not in _SIGMOID:
-                known = " or ".join(_SIGMOID)
-                raise SplashbenchError(f"{arguments.path}: rgbfunction is {decoder[:40]!r}; train with {known}")
+                decoders = " or ".join(_SIGMOID)
+                raise SplashbenchError(f"{arguments.path}: rgbfunction is {decoder[:40]!r}; train with {decoders}")
             model.sigmoid.fill_(_SIGMOID[decoder])
             weights = path.with_suffix(".pt")
             # Convolutions of one pixel.

@@ -90,6 +90,6 @@ def shrunk(plate: CleanPlate, longest_side: int) -> CleanPlate:
     # A shrunk pixel counts where most of it was seen, with the mean of what was.
     share = cv2.resize(plate.seen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     total = cv2.resize((plate.image * plate.seen[..., None]).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    kept = np.asarray(share > 0.9)
-    mean = np.where(kept[..., None], total / np.maximum(share, 1e-6)[..., None], np.float32(0))
-    return CleanPlate(small, np.clip(np.rint(mean), 0, 255).astype(np.uint8), kept)
+    mostly_seen = np.asarray(share > 0.9)
+    mean = np.where(mostly_seen[..., None], total / np.maximum(share, 1e-6)[..., None], np.float32(0))
+    return CleanPlate(small, np.clip(np.rint(mean), 0, 255).astype(np.uint8), mostly_seen)

@@ -123,11 +123,11 @@ def _prior(points: NDArray, camera: Camera) -> NDArray[np.float32] | None:
 
 def _inverse_range(priors: list[NDArray[np.float32] | None], cameras: list[Camera]) -> tuple[float, float]:
     """Smallest and largest inverse depth worth looking at."""
-    known = [prior for prior in priors if prior is not None]
-    if not known:
+    usable = [prior for prior in priors if prior is not None]
+    if not usable:
         distance = float(np.median([_distance_looked_at(camera, cameras) for camera in cameras]))
         return _FAR / distance, _NEAR / distance
-    values = np.concatenate([prior.ravel() for prior in known])
+    values = np.concatenate([prior.ravel() for prior in usable])
     low, high = np.percentile(values, [1, 99])
     return float(low) * (1 - _RANGE_MARGIN), float(high) * (1 + _RANGE_MARGIN)
 

@@ -83,16 +83,18 @@ def _lift(
     cell = uv.astype(int)
     uv, cell = (a[plate.seen[cell[:, 1], cell[:, 0]]] for a in (uv, cell))
     inverse = np.zeros(len(uv))
-    kept = unknown = np.ones(len(uv), dtype=bool)
+    used = unknown = np.ones(len(uv), dtype=bool)
     if depth is not None:
         row, column, _ = pixels_at(depth.camera, uv * depth.camera.width / camera.width)
         inverse = depth.inverse[row, column].astype(np.float64)
         trusted = depth.trusted[row, column]
         # What trusted pixels of other views cover needs no worse guess.
-        kept, unknown = trusted | ~depth.covered[row, column], ~trusted
-    known = None if points is None else interpolated(points[:, :3], camera, uv[unknown])
-    inverse[unknown] = guessed(camera, [p.camera for p in plates], int(unknown.sum()), rng) if known is None else known
-    return lift(camera, uv[kept], inverse[kept]), plate.image[cell[kept, 1], cell[kept, 0]] / 255
+        used, unknown = trusted | ~depth.covered[row, column], ~trusted
+    interpolation = None if points is None else interpolated(points[:, :3], camera, uv[unknown])
+    inverse[unknown] = (
+        guessed(camera, [p.camera for p in plates], int(unknown.sum()), rng) if interpolation is None else interpolation
+    )
+    return lift(camera, uv[used], inverse[used]), plate.image[cell[used, 1], cell[used, 0]] / 255
 
 
 def _merge(positions: NDArray, colors: NDArray, count: int) -> AnchorSeed:

@@ -71,10 +71,10 @@ class DensityControl:
 
     def observe(self, camera: Camera, splats: Splats, gradients: Tensor) -> None:
         """Take note of a view; gradients: of its loss by the means [N, 3]."""
-        found = gradients.numpy()
+        pulls = gradients.numpy()
         rows = slice(None) if splats.rows is None else splats.rows.numpy()
-        self._gradient[rows] += screen_gradients(camera, splats.means.detach().numpy(), found)
-        self._visits[rows] += found.any(axis=1)
+        self._gradient[rows] += screen_gradients(camera, splats.means.detach().numpy(), pulls)
+        self._visits[rows] += pulls.any(axis=1)
 
     def after_step(self, step: int) -> None:
         """What is due after step number `step`, counted from 0."""

@@ -141,5 +141,5 @@ def load_tables(model_file: Path, model: DynamicModel, rows: tuple[str, ...]) ->
     try:
         model.load_state_dict({name: torch.from_numpy(arrays[name]) for name in shapes})
     except RuntimeError as error:
-        said = one_line(str(error))
-        raise SplashbenchError(f"{model_file} does not go with this method ({said}); fit again") from None
+        cause = one_line(str(error))
+        raise SplashbenchError(f"{model_file} does not go with this method ({cause}); fit again") from None

@@ -74,11 +74,11 @@ class RowOptimizer:
         groups: list[dict[str, Any]] = []
         matrices: list[dict[str, Any]] = []
         for name in self.rates:
-            found, share = self._parameters(name), 1.0
+            parameters, share = self._parameters(name), 1.0
             if name in orthogonal:
-                matrices.append({"params": [p for p in found if p.ndim == 2], "name": name, "share": share})
-                found, share = [p for p in found if p.ndim != 2], _BESIDE_MUON
-            groups.append({"params": found, "name": name, "share": share})
+                matrices.append({"params": [p for p in parameters if p.ndim == 2], "name": name, "share": share})
+                parameters, share = [p for p in parameters if p.ndim != 2], _BESIDE_MUON
+            groups.append({"params": parameters, "name": name, "share": share})
         self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self._optimizers: list[torch.optim.Optimizer] = [self.adam]
         if matrices:

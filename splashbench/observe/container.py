@@ -42,14 +42,14 @@ def _in_front(triangles: np.ndarray, near: float) -> np.ndarray:
     front = triangles[..., 2] >= near
     count = front.sum(axis=1)
     parts = [triangles[count == 3]]
-    for wanted in (1, 2):
-        chosen, sides = triangles[count == wanted], front[count == wanted]
+    for corners in (1, 2):
+        chosen, sides = triangles[count == corners], front[count == corners]
         # Turn each so that the corner that differs from the two others comes first.
-        odd = np.argmax(sides == (wanted == 1), axis=1)
+        odd = np.argmax(sides == (corners == 1), axis=1)
         rows = np.arange(len(chosen))
         a, b, c = (chosen[rows, (odd + turn) % 3] for turn in range(3))
         ab, ac = _cut(a, b, near), _cut(a, c, near)
-        if wanted == 1:
+        if corners == 1:
             parts.append(np.stack([a, ab, ac], axis=1))
         else:
             parts += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]

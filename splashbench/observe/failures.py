@@ -41,11 +41,11 @@ def distrust_failed_masks(silhouettes: Silhouettes, container: ContainerOcclusio
         missing = missing_shares(silhouettes, container)
         usual = np.median(missing, axis=0)
         spread = 1.4826 * np.median(np.abs(missing - usual), axis=0)
-        found = missing > usual + np.maximum(_MISSING_SHARE + usual, _DEVIATIONS * spread)
-        found &= silhouettes.sees_liquid & ~silhouettes.failed_masks
-        if not found.any():
+        failed = missing > usual + np.maximum(_MISSING_SHARE + usual, _DEVIATIONS * spread)
+        failed &= silhouettes.sees_liquid & ~silhouettes.failed_masks
+        if not failed.any():
             break
-        silhouettes.distrust(found)
+        silhouettes.distrust(failed)
     return silhouettes.failed_masks & ~before
 
 
@@ -70,13 +70,13 @@ def missing_shares(silhouettes: Silhouettes, container: ContainerOcclusion | Non
             others = np.max(np.delete(each, view, axis=0), axis=0)
             if carving is not None:
                 np.maximum(others, carving.outside, out=others)
-            own = silhouettes.certain_distance(view, t)
-            area[t, view] = (own < 0).sum() / patch.size**2
+            mask_distance = silhouettes.certain_distance(view, t)
+            area[t, view] = (mask_distance < 0).sum() / patch.size**2
             _cover(
                 others.ravel(),
                 patch.of_node,
                 patch.pixels,
-                own,
+                mask_distance,
                 silhouettes.windows[view].corner,
                 _DEPTH,
                 _MARGIN * patch.size,
@@ -119,14 +119,14 @@ def _cover(
     others: np.ndarray,
     patch_of: np.ndarray,
     pixels: np.ndarray,
-    own: np.ndarray,
+    mask_distance: np.ndarray,
     corner: np.ndarray,
     depth: float,
     margin: float,
     covered: np.ndarray,
     dry: np.ndarray,
 ) -> None:
-    height, width = own.shape
+    height, width = mask_distance.shape
     for n in range(len(others)):
         if others[n] > -depth or patch_of[n] < 0:
             continue
@@ -136,5 +136,5 @@ def _cover(
         inside_column = min(max(column, 0), width - 1)
         inside_row = min(max(row, 0), height - 1)
         beyond = np.sqrt(float((column - inside_column) ** 2 + (row - inside_row) ** 2))
-        if own[inside_row, inside_column] + beyond > margin:
+        if mask_distance[inside_row, inside_column] + beyond > margin:
             dry[patch_of[n]] = True

@@ -30,8 +30,8 @@ def initial_points(scene: Scene | TrainingScene, liquid_per_frame: int) -> Initi
     that the training views have at its place, whatever is in front of it. Raises SplashbenchError when the masks have
     no common hull.
     """
-    own = scene.initial_points()
-    static = np.zeros((0, 6)) if own is None else own[:, :6].astype(np.float64)
+    sparse = scene.initial_points()
+    static = np.zeros((0, 6)) if sparse is None else sparse[:, :6].astype(np.float64)
     if liquid_per_frame < 1:
         return InitialPoints(static, tuple(np.zeros((0, 6)) for _ in range(scene.n_frames)))
     silhouettes = Silhouettes(scene)

@@ -83,10 +83,10 @@ class ViewOcclusion:
             window = window.joined(ImageWindow.around(covered))
         self.window = window
         self.nearest = np.ascontiguousarray(depth[window.slices])
-        found = self.nearest[np.isfinite(self.nearest)]
-        quantiles = np.unique(np.quantile(found, np.arange(1, _LAYERS) / _LAYERS)) if len(found) else np.zeros(0)
+        depths = self.nearest[np.isfinite(self.nearest)]
+        quantiles = np.unique(np.quantile(depths, np.arange(1, _LAYERS) / _LAYERS)) if len(depths) else np.zeros(0)
         #: depths from which each layer but the first counts
-        self.starts = np.append(quantiles, found.max() * (1 + 1e-6)) if len(found) else np.zeros(0)
+        self.starts = np.append(quantiles, depths.max() * (1 + 1e-6)) if len(depths) else np.zeros(0)
         self._hidden = np.zeros((len(self.starts), *self.nearest.shape), dtype=np.int16)
         for layer, start in enumerate(self.starts):
             pixels = np.clip(signed_distance_2d(self.nearest < start), -_FARTHEST_PIXELS, _FARTHEST_PIXELS)
@@ -119,8 +119,8 @@ class ViewOcclusion:
             either = liquid | (behind < 0)
             joined = np.minimum(silhouette, behind)
             # Where the two meet, the outline of neither is one of their union. (A view that says nothing has none.)
-            own = liquid & ((behind > -silhouette) | (silhouette <= NO_EVIDENCE))
-            layers[layer] = np.where(either & ~own, -inner_distance(either), joined)
+            outlined = liquid & ((behind > -silhouette) | (silhouette <= NO_EVIDENCE))
+            layers[layer] = np.where(either & ~outlined, -inner_distance(either), joined)
         return layers
 
     def carve(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, second: np.ndarray | None = None) -> None:

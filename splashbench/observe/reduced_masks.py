@@ -56,9 +56,9 @@ def reduced(scene: MaskedScene, cells: int) -> MaskedScene:
             ImageWindow.around(mask) for mask in (scene.mask(view, t) for t in range(scene.n_frames)) if mask.any()
         ]
         if windows:
-            whole = windows[0]
+            union = windows[0]
             for window in windows[1:]:
-                whole = whole.joined(window)
-            longest.append(max(whole.shape))
+                union = union.joined(window)
+            longest.append(max(union.shape))
     factor = int(min(longest) / cells / PIXELS_PER_VOXEL) if longest else 1
     return ReducedScene(scene, factor) if factor > 1 else scene

@@ -234,9 +234,15 @@ class Silhouettes:
         return self._distance(view, self.evidence_mask(view, t), window)
 
     def _distance(self, view: int, mask: np.ndarray, window: ImageWindow | None) -> np.ndarray:
-        own = self.windows[view]
-        if window is not None and window != own:
-            mask = np.pad(mask, ((own.y0 - window.y0, window.y1 - own.y1), (own.x0 - window.x0, window.x1 - own.x1)))
+        mask_window = self.windows[view]
+        if window is not None and window != mask_window:
+            mask = np.pad(
+                mask,
+                (
+                    (mask_window.y0 - window.y0, window.y1 - mask_window.y1),
+                    (mask_window.x0 - window.x0, window.x1 - mask_window.x1),
+                ),
+            )
         if not mask.any() and not self.sees_liquid[:, view].any():
             # A camera without a single usable mask votes for nothing and against nothing.
             return np.full(mask.shape, NO_EVIDENCE, dtype=np.float32)
@@ -249,35 +255,35 @@ def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], ImageWindow,
     Packed one by one, as all masks at once would be eight times as large.
     """
     ever: np.ndarray | None = None
-    whole = []
+    masks = []
     full = True
     for t in range(scene.n_frames):
         mask = scene.mask(view, t)
         ever = mask.copy() if ever is None else np.logical_or(ever, mask, out=ever)
         full &= bool(mask.all())
-        whole.append(np.packbits(mask))
+        masks.append(np.packbits(mask))
     assert ever is not None
     window = ImageWindow.around(ever, MARGIN_PIXELS)
-    sees = np.array([bits.any() for bits in whole])
-    for t, bits in enumerate(whole):
+    sees = np.array([bits.any() for bits in masks])
+    for t, bits in enumerate(masks):
         mask = np.unpackbits(bits, count=ever.size).reshape(ever.shape)[window.slices]
-        whole[t] = np.packbits(mask)
-    return whole, window, sees, full
+        masks[t] = np.packbits(mask)
+    return masks, window, sees, full
 
 
 def _between(scene: MaskedScene, view: str, interpolate: bool | None) -> list[tuple[int, int, float]]:
     """For each frame, the two frames of `view` about the scene's time, and the share of the second."""
     alone = [(t, t, 0.0) for t in range(scene.n_frames)]
     # Optional, as a scene may have no more than masks and cameras.
-    times, own = getattr(scene, "times", None), getattr(scene, "camera_times", {}).get(view)
-    if interpolate is False or times is None or own is None or scene.n_frames < 2:
+    times, exposed = getattr(scene, "times", None), getattr(scene, "camera_times", {}).get(view)
+    if interpolate is False or times is None or exposed is None or scene.n_frames < 2:
         return alone
     step = float(np.diff(times).mean())
-    if interpolate is None and np.abs(own - times).max() <= _SAME_TIME * step:
+    if interpolate is None and np.abs(exposed - times).max() <= _SAME_TIME * step:
         return alone
     for t, time in enumerate(times):
-        before = int(np.clip(np.searchsorted(own, time, side="right") - 1, 0, scene.n_frames - 2))
-        share = float(np.clip((time - own[before]) / (own[before + 1] - own[before]), 0.0, 1.0))
+        before = int(np.clip(np.searchsorted(exposed, time, side="right") - 1, 0, scene.n_frames - 2))
+        share = float(np.clip((time - exposed[before]) / (exposed[before + 1] - exposed[before]), 0.0, 1.0))
         alone[t] = (before, before + 1, share) if share < 1 else (before + 1, before + 1, 0.0)
     return alone
 
@@ -292,8 +298,8 @@ def blended(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
     between = (1 - np.float32(share)) * first + np.float32(share) * second
     nearer = first if share <= 0.5 else second
     count, labels = cv2.connectedComponents((nearer < 0).astype(np.uint8), connectivity=8)
-    kept = np.zeros(count, dtype=bool)
-    kept[labels[between < 0]] = True
-    lost = ~kept
+    present = np.zeros(count, dtype=bool)
+    present[labels[between < 0]] = True
+    lost = ~present
     lost[0] = False
     return np.where(lost[labels], np.minimum(nearer, between), between)

@@ -150,13 +150,13 @@ def fit_appearance(
         seed,
     )
     rng = np.random.default_rng([seed, 1])
-    held = np.zeros(len(targets), dtype=bool)
+    withheld_targets = np.zeros(len(targets), dtype=bool)
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
     if settings.validation_share > 0:
         adaptive = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
         if adaptive.may_stop:
-            held = withheld(len(targets), settings.validation_share, np.random.default_rng([seed, 3]))
-        if held.any() or not adaptive.may_stop:
+            withheld_targets = withheld(len(targets), settings.validation_share, np.random.default_rng([seed, 3]))
+        if withheld_targets.any() or not adaptive.may_stop:
             schedule = adaptive
 
     def seen(
@@ -166,8 +166,8 @@ def fit_appearance(
         state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
         state = replace(state, visibility=target.visibility)
         of_cells = cells[target.frame] if penalised else None
-        children, found = decoder.decode(frame_features, frame_scales, None, state, target.eye, of_cells)
-        return *composite(children, target.camera, target.background), found
+        children, penalty_terms = decoder.decode(frame_features, frame_scales, None, state, target.eye, of_cells)
+        return *composite(children, target.camera, target.background), penalty_terms
 
     def of_frame(t: int) -> tuple[Tensor, Tensor]:
         return features.of_frame(t), appearance.log_scales.index_select(0, ids[t])
@@ -175,11 +175,11 @@ def fit_appearance(
     @torch.no_grad()
     def loss_of_withheld() -> float:
         weights, total = settings.weights, 0.0
-        for number in np.nonzero(held)[0]:
+        for number in np.nonzero(withheld_targets)[0]:
             target = targets[number]
             image, alpha, _ = seen(target, *of_frame(target.frame), penalised=False)
             total += float(image_loss(image, alpha, target, weights, weights.ssim))
-        return total / int(held.sum())
+        return total / int(withheld_targets.sum())
 
     queue: list[int] = []
     history: list[float] = []
@@ -191,16 +191,16 @@ def fit_appearance(
         if factor is None:
             break
         if not queue:
-            fitted = np.nonzero(~held)[0] if schedule.withholds else np.arange(len(targets))
+            fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
         target = targets[queue.pop()]
         active = [values.requires_grad_() for values in of_frame(target.frame)]
-        image, alpha, found = seen(target, active[0], active[1], penalised=True)
-        assert found is not None
+        image, alpha, penalty_terms = seen(target, active[0], active[1], penalised=True)
+        assert penalty_terms is not None
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
         loss = image_loss(image, alpha, target, settings.weights, ssim_weight)
-        loss = loss + penalty_loss(found, track.grid.voxel, settings.weights)
+        loss = loss + penalty_loss(penalty_terms, track.grid.voxel, settings.weights)
         history.append(float(loss.detach()))
         if not math.isfinite(history[-1]):
             raise SplashbenchError(

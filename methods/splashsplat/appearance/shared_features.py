@@ -60,8 +60,8 @@ class SharedFeatures:
         for size in sizes:
             cells = torch.from_numpy(cells_of(born, size, rng.random(4)))
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
-            found = [torch.unique(cells.index_select(0, ids), return_inverse=True) for ids in self._ids]
-            rows, members = [rows for rows, _ in found], [members for _, members in found]
+            cells_of_frames = [torch.unique(cells.index_select(0, ids), return_inverse=True) for ids in self._ids]
+            rows, members = [rows for rows, _ in cells_of_frames], [members for _, members in cells_of_frames]
             self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), rows, members))
 
     def of_frame(self, t: int) -> Tensor:

@@ -48,9 +48,9 @@ def within_capacity(cells: np.ndarray, ids: np.ndarray, capacity: int) -> np.nda
     first = np.ones(len(cells), dtype=bool)
     first[1:] = ordered[1:] != ordered[:-1]
     group_start = np.maximum.accumulate(np.where(first, np.arange(len(cells)), 0))
-    kept = np.empty(len(cells), dtype=bool)
-    kept[order] = np.arange(len(cells)) - group_start < capacity
-    return kept
+    allowed = np.empty(len(cells), dtype=bool)
+    allowed[order] = np.arange(len(cells)) - group_start < capacity
+    return allowed
 
 
 def target_population(phi: np.ndarray, centres: np.ndarray, ratio: float, shell: ShellSettings) -> np.ndarray:

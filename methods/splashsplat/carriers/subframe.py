@@ -77,8 +77,8 @@ class Track:
         if fraction != 0 and len(positions):
             step, other = (t, t + 1) if fraction > 0 else (t - 1, t - 1)
             positions, deformation = self.motion.step(step).forecast(positions, deformation, fraction)
-            here, there = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
-            phi = ((1 - abs(fraction)) * here + abs(fraction) * there).astype(np.float32)
+            nearer, farther = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
+            phi = ((1 - abs(fraction)) * nearer + abs(fraction) * farther).astype(np.float32)
         scene_positions = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))
         return CarrierState(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
 

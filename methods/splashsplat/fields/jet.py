@@ -74,11 +74,11 @@ def open_floor(frames: Sequence[Slices], voxel: float) -> float:
 
     Going down from the top, the stream ends where the usual cross-section is several times what it was above.
     """
-    whole = _merged(list(frames), voxel)
-    for n in range(len(whole.height) - _SLICES_AT_LEAST, -1, -1):
-        if whole.area[n] > _BODY * np.median(whole.area[n + 1 :]):
-            return float(whole.height[n] + 2 * voxel)
-    return float(whole.height[0]) if len(whole.height) else float("inf")
+    usual = _merged(list(frames), voxel)
+    for n in range(len(usual.height) - _SLICES_AT_LEAST, -1, -1):
+        if usual.area[n] > _BODY * np.median(usual.area[n + 1 :]):
+            return float(usual.height[n] + 2 * voxel)
+    return float(usual.height[0]) if len(usual.height) else float("inf")
 
 
 def framed(slices: Slices, cameras: Sequence[Camera], turn: np.ndarray) -> Slices:
@@ -161,12 +161,12 @@ def fit_jets(frames: list[Slices], times: np.ndarray, gravity: float, voxel: flo
     _, speed, paths = min(tried, key=lambda explained: explained[0])
     if speed in (speeds[0], speeds[-1]):  # nothing bends, thins or falls: any speed will do
         return [None] * len(frames)
-    found = {number: path for number, path in zip(used, paths) if path is not None}
+    path_of_group = {number: path for number, path in zip(used, paths) if path is not None}
     jets: list[Jet | None] = []
     for t in range(len(frames)):
-        near = [number for number in found if abs(number - t // _STEADY) <= 1]
+        near = [number for number in path_of_group if abs(number - t // _STEADY) <= 1]
         if near:
-            path, radius = found[min(near, key=lambda number: abs(number - t // _STEADY))]
+            path, radius = path_of_group[min(near, key=lambda number: abs(number - t // _STEADY))]
             jets.append(Jet(top, path[0], path[1], speed, gravity, radius))
         else:
             jets.append(None)

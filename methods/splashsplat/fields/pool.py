@@ -68,12 +68,12 @@ class Pool:
 
     def levels(self) -> np.ndarray:
         """Height of the pool in every frame, float64 [T] scene units, NaN where there is none; see `level`."""
-        found = np.array([self.level(t) for t in range(self._silhouettes.n_frames)])
-        trusted = found[:, 1] >= _MIN_OVERLAP
-        levels = np.full(len(found), np.nan)
+        candidates = np.array([self.level(t) for t in range(self._silhouettes.n_frames)])
+        trusted = candidates[:, 1] >= _MIN_OVERLAP
+        levels = np.full(len(candidates), np.nan)
         for t in np.nonzero(trusted)[0]:
             near = slice(max(t - _STEADY, 0), t + _STEADY + 1)
-            levels[t] = np.median(found[near, 0][trusted[near]])
+            levels[t] = np.median(candidates[near, 0][trusted[near]])
         return levels
 
     def level(self, t: int) -> tuple[float, float]:

@@ -213,7 +213,7 @@ def apply_pressure(
     cells: np.ndarray,
     number: np.ndarray,
     pressure: np.ndarray,
-    known: np.ndarray,
+    has_velocity: np.ndarray,
 ) -> None:
     """Subtracts the pressure gradient on the open faces of the liquid cells, in place, and marks them 1 in `known`."""
     place = np.empty(3, np.int64)
@@ -223,9 +223,9 @@ def apply_pressure(
             place[0], place[1], place[2] = cells[n, 0], cells[n, 1], cells[n, 2]
             place[a] += after
             i, j, k = place[0], place[1], place[2]
-            if shares[a, i, j, k] == 0 or known[a, i, j, k] == 1:
+            if shares[a, i, j, k] == 0 or has_velocity[a, i, j, k] == 1:
                 continue
-            known[a, i, j, k] = 1
+            has_velocity[a, i, j, k] = 1
             low, high = 0.0, 0.0
             if i < number.shape[0] and j < number.shape[1] and k < number.shape[2] and number[i, j, k] >= 0:
                 high = pressure[number[i, j, k]]

@@ -171,21 +171,21 @@ class FlipSolver:
             field[a] += duration * self._gravity[a]
         number = np.full(self._shape, -1, np.int32)
         cells = number_cells(positions, self._shares, self._buried, number)
-        known = np.zeros(field.shape, np.uint8)
+        has_velocity = np.zeros(field.shape, np.uint8)
         if len(cells):
             system = assemble(cells, number, self._shares)
             right = -divergence(field, self._shares, cells)
             pressure, iterations = solve(*system, right, settings.pressure_iterations, settings.pressure_tolerance)
-            apply_pressure(field, self._shares, cells, number, pressure, known)
-            left = divergence(field, self._shares, cells)[system[2] > 0]
+            apply_pressure(field, self._shares, cells, number, pressure, has_velocity)
+            remaining = divergence(field, self._shares, cells)[system[2] > 0]
             self.report.iterations = max(self.report.iterations, iterations)
-            self.report.divergence = float(np.abs(left).max(initial=0.0))
+            self.report.divergence = float(np.abs(remaining).max(initial=0.0))
         # The change is carried beyond the liquid as a field of its own: in free flight it is the same everywhere,
         # whatever the velocities of the particles.
-        known[~covered] = 0
+        has_velocity[~covered] = 0
         change += field
-        over_range(extrapolate, 3, change, known.copy(), _LAYERS)
-        over_range(extrapolate, 3, field, known, _LAYERS)
+        over_range(extrapolate, 3, change, has_velocity.copy(), _LAYERS)
+        over_range(extrapolate, 3, field, has_velocity, _LAYERS)
         slide(field, self._walls, self._normals)
         fixed = (field, change, positions, settings.flip_ratio)
         over_range(to_particles, len(positions), *fixed, velocities, smallest=_SMALL_LOOP)

@@ -29,11 +29,11 @@ def gated(control: np.ndarray, factor: int, before: np.ndarray, after: np.ndarra
     size = int(np.prod(coarse))
     gains, counts = np.zeros(size), np.zeros(size)
     # Forwards from what is liquid now, which shows where it leaves, and backwards from what will be, where it arrives.
-    for here, there, direction in ((before, after, 1), (after, before, -1)):
-        nodes = np.argwhere((here <= 0) & (here >= -_SHELL)).astype(np.float32)
+    for start, end, direction in ((before, after, 1), (after, before, -1)):
+        nodes = np.argwhere((start <= 0) & (start >= -_SHELL)).astype(np.float32)
         identity = np.broadcast_to(np.eye(3, dtype=np.float32), (len(nodes), 3, 3))
         moved, _ = forecast(direction * control, factor, nodes, identity)
-        gain = np.maximum(sample(there, nodes), 0) - np.maximum(sample(there, moved), 0)
+        gain = np.maximum(sample(end, nodes), 0) - np.maximum(sample(end, moved), 0)
         cell = np.ravel_multi_index(tuple(np.minimum(nodes.astype(int) // factor, np.array(coarse) - 1).T), coarse)
         gains += np.bincount(cell, gain, minlength=size)
         counts += np.bincount(cell, minlength=size)

@@ -36,16 +36,16 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     if is_traced(path):
         return {name: torch.from_numpy(array.copy()) for name, array in traced_weights(path, _MAX_BYTES).items()}
     try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     # What its reader stumbles over in a damaged or hostile file may be anything.
     except Exception as error:
-        said = one_line(str(error)).split(". ")[0][:200]
+        cause = one_line(str(error)).split(". ")[0][:200]
         raise SplashbenchError(
-            f"{path} cannot be read as weights alone ({type(error).__name__}: {said}); save its state_dict() instead"
+            f"{path} cannot be read as weights alone ({type(error).__name__}: {cause}); save its state_dict() instead"
         ) from None
-    if not (isinstance(found, Mapping) and all(isinstance(tensor, Tensor) for tensor in found.values())):
-        raise SplashbenchError(f"{path} holds a {type(found).__name__}, not tensors by name; save state_dict()")
-    return {str(name): tensor for name, tensor in found.items()}
+    if not (isinstance(content, Mapping) and all(isinstance(tensor, Tensor) for tensor in content.values())):
+        raise SplashbenchError(f"{path} holds a {type(content).__name__}, not tensors by name; save state_dict()")
+    return {str(name): tensor for name, tensor in content.items()}
 
 
 def _require_size(path: Path) -> None:
@@ -69,17 +69,17 @@ def fill(slots: Mapping[str, Tensor], weights: Mapping[str, Tensor], path: Path)
     unknown = [name for name in weights if name not in slots]
     if unknown:
         raise SplashbenchError(f"{path} has {one_line(unknown[0])[:80]}, which this network has not; {_REMEDY}")
-    for name, own in slots.items():
+    for name, slot in slots.items():
         tensor = weights.get(name)
         if tensor is None:
             raise SplashbenchError(f"{path} lacks {name}; {_REMEDY}")
-        if tensor.shape != own.shape or tensor.dtype not in _KINDS or tensor.layout != torch.strided:
+        if tensor.shape != slot.shape or tensor.dtype not in _KINDS or tensor.layout != torch.strided:
             kind = str(tensor.dtype).removeprefix("torch.")
             raise SplashbenchError(
-                f"{path}: {name} is {kind} {list(tensor.shape)}, not float32 {list(own.shape)}; {_REMEDY}"
+                f"{path}: {name} is {kind} {list(tensor.shape)}, not float32 {list(slot.shape)}; {_REMEDY}"
             )
         if not torch.isfinite(tensor).all():
             raise SplashbenchError(f"{path}: {name} has NaN or infinite entries; the fit failed, repeat it")
     with torch.no_grad():
-        for name, own in slots.items():
-            own.copy_(weights[name])
+        for name, slot in slots.items():
+            slot.copy_(weights[name])

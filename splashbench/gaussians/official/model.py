@@ -84,8 +84,8 @@ def require_finite(fitted: OfficialFitted, path: Path) -> OfficialFitted:
             time = fitted.model_time(float(seconds))
             for camera in list(fitted.scene.cameras.values())[:1]:
                 splats = fitted.model.splats(fitted.model.at(time), fitted.lens(camera))
-                found = {name: getattr(splats, name) for name in ("means", "factors", "opacities", "colors")}
-                for name, values in [("means", fitted.model.means(time)), *found.items()]:
+                tables = {name: getattr(splats, name) for name in ("means", "factors", "opacities", "colors")}
+                for name, values in [("means", fitted.model.means(time)), *tables.items()]:
                     if not torch.isfinite(values).all():
                         raise SplashbenchError(
                             f"{path}: {name} of the Gaussians overflow at {seconds:g} s; the fit failed, repeat it"

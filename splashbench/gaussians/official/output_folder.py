@@ -21,8 +21,8 @@ _MAX_ARGUMENTS_BYTES = 1 << 16
 
 def last_iteration(folder: Path) -> int:
     """The largest N of the folders `folder`/iteration_N. Raises SplashbenchError where there is none."""
-    found = [_ITERATION.fullmatch(path.name) for path in folder.iterdir()] if folder.is_dir() else []
-    numbers = [int(match[1]) for match in found if match]
+    matches = [_ITERATION.fullmatch(path.name) for path in folder.iterdir()] if folder.is_dir() else []
+    numbers = [int(match[1]) for match in matches if match]
     if not numbers:
         raise SplashbenchError(f"{folder} holds no iteration_<n>; let the code save its last iteration")
     return max(numbers)

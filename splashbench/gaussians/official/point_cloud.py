@@ -82,9 +82,9 @@ def read_point_cloud(path: Path) -> PointCloud:
         if not head.startswith((b"ply\n", b"ply\r\n")) or end is None:
             raise SplashbenchError(f"{path} is no .ply (it has no such header); give the file as the code saved it")
         count, kind = _header(path, head[: end.start()].decode("ascii", "replace").splitlines())
-        there = (path.stat().st_size - end.end()) // kind.itemsize
-        if count > there:
-            raise SplashbenchError(f"{path} is cut short: {there} of {count} points are there; copy it again")
+        available = (path.stat().st_size - end.end()) // kind.itemsize
+        if count > available:
+            raise SplashbenchError(f"{path} is cut short: {available} of {count} points are there; copy it again")
         points = np.fromfile(path, kind, count, offset=end.end())
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; let the code save its last iteration") from None

@@ -81,10 +81,10 @@ def traced_weights(path: Path, max_bytes: int) -> dict[str, NDArray[np.floating]
                 raise SplashbenchError(f"{path}: its list of weights is too long; give the file as the code saved it")
             with warnings.catch_warnings():
                 warnings.simplefilter("error")  # of pickletools, at names that are none
-                found = _arrays(_read(archive.read(program)))
+                rebuilds = _arrays(_read(archive.read(program)))
             storages: dict[str, NDArray] = {}
             arrays = {}
-            for name, arguments in found.items():
+            for name, arguments in rebuilds.items():
                 arrays[name] = _array(arguments, archive, program.removesuffix(".pkl"), storages)
                 if sum(array.nbytes for array in arrays.values()) > max_bytes:
                     raise _NotWeightsError("arrays in many places")
@@ -97,8 +97,8 @@ def traced_weights(path: Path, max_bytes: int) -> dict[str, NDArray[np.floating]
             "save state_dict() of the network with torch.save instead"
         ) from None
     except (zipfile.BadZipFile, zlib.error, *_DAMAGED) as error:
-        said = f"{type(error).__name__}: {error}"[:160]
-        raise SplashbenchError(f"{path} is damaged ({said}); copy it again") from None
+        cause = f"{type(error).__name__}: {error}"[:160]
+        raise SplashbenchError(f"{path} is damaged ({cause}); copy it again") from None
 
 
 def _read(program: bytes) -> Any:
@@ -159,19 +159,19 @@ def _read(program: bytes) -> Any:
 
 def _arrays(root: Any) -> dict[str, tuple]:
     """How each array below `root` is to be rebuilt, by its name."""
-    found: dict[str, tuple] = {}
-    left = [("", root)]
+    arrays: dict[str, tuple] = {}
+    pending = [("", root)]
     for _ in range(_MAX_MODULES):
-        if not left:
-            return found
-        name, value = left.pop()
+        if not pending:
+            return arrays
+        name, value = pending.pop()
         if len(name) > _MAX_PATH:
             break
         if value.kind == _REBUILD:
-            found[name] = value.arguments
+            arrays[name] = value.arguments
         elif value.kind.startswith("__torch__."):
             inner = [(f"{name}.{key}" if name else key, part) for key, part in value.state.items()]
-            left += [(key, part) for key, part in inner if isinstance(part, _Object)]
+            pending += [(key, part) for key, part in inner if isinstance(part, _Object)]
         else:
             raise _NotWeightsError(value.kind)
     raise _NotWeightsError("modules without end")
