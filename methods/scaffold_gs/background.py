@@ -108,7 +108,7 @@ def fit_background(
             plates.append(plate)
     if not plates:
         when = "in frame 0" if settings.frames == "first" else "throughout"
-        raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; mend the masks")
+        raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; fix the masks")
     far_color = np.median(np.concatenate([plate.image[plate.seen] for plate in plates]), axis=0) / 255
     progress(0.05, "depths of the background")
     seed = _seed(points, plates, settings, run.seed)

@@ -94,16 +94,16 @@ def signed_distance_fields(
     views: Sequence[str] | None = None,
     method: DistanceMethod = "silhouette",
     container: ContainerOcclusion | None = None,
-    find_failures: bool = False,
+    detect_failed_masks: bool = False,
 ) -> SignedDistanceFields:
     """phi of all frames from the masks of `views` (all training views by default).
 
     The grid spans the box around the hulls of all frames with 10% padding, with `cells_longest_axis` cubic cells
-    along its longest side. container: see `signed_distance_frames`. find_failures: whether masks that miss large parts
-    of the liquid are looked for and replaced (failures.py). Raises SplashbenchError when the masks have no common hull.
+    along its longest side. container: see `signed_distance_frames`. detect_failed_masks: whether masks that miss large
+    parts of the liquid are looked for and replaced (failures.py). Raises SplashbenchError when the masks have no common hull.
     """
     silhouettes = Silhouettes(scene, views)
-    if find_failures:
+    if detect_failed_masks:
         distrust_failed_masks(silhouettes, container)
     bounds = sequence_bounds(silhouettes, container)
     grid = Grid.over(bounds.padded(PADDING), cells_longest_axis)

@@ -101,7 +101,7 @@ FLOOR = (0.1, 0.12, 0.25)
 
 
 class TestPlainViews:
-    """Liquid over one colour, as in made-up recordings: no point has a depth there, so there are none."""
+    """Liquid over one colour, as in synthetic recordings: no point has a depth there, so there are none."""
 
     @pytest.fixture
     def plain(self, balls: Scene) -> TrainingScene:

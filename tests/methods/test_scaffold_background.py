@@ -140,12 +140,12 @@ def test_a_view_that_is_liquid_throughout_is_left_out_and_all_of_them_are_an_err
     assert psnr(background.render(scene.cameras[name]), scene.image(name, 0) / 255.0, dry) > 18
     for name in scene.train[1:]:
         _paint(scene.mask_path(name, 0), full)
-    with pytest.raises(SplashbenchError, match=r"every training view in frame 0; mend the masks"):
+    with pytest.raises(SplashbenchError, match=r"every training view in frame 0; fix the masks"):
         fit_background(scene.training(), BackgroundSettings(frames="first"), Run(seed=0))
     for name in scene.train[1:]:
         for t in range(scene.n_frames):
             _paint(scene.mask_path(name, t), full)
-    with pytest.raises(SplashbenchError, match=r"every training view throughout; mend the masks"):
+    with pytest.raises(SplashbenchError, match=r"every training view throughout; fix the masks"):
         fit_background(scene.training(), TINY, Run(seed=0))
 
 

@@ -82,20 +82,20 @@ def test_a_cut_mask_costs_liquid_only_until_it_is_found() -> None:
     scene.changed = {("1", 4): "cut"}
     cut = signed_distance_fields(scene, 40)
     assert inside(scene, cut, 4) < 0.75
-    mended = signed_distance_fields(scene, 40, find_failures=True)
-    assert inside(scene, mended, 4) > 0.99
+    fixed = signed_distance_fields(scene, 40, detect_failed_masks=True)
+    assert inside(scene, fixed, 4) > 0.99
 
 
 def test_a_camera_that_never_sees_liquid_takes_nothing_away() -> None:
     scene = MovingBall()
     scene.changed = {("2", t): "empty" for t in range(scene.n_frames)}
-    assert inside(scene, signed_distance_fields(scene, 32, find_failures=True), 4) > 0.99
+    assert inside(scene, signed_distance_fields(scene, 32, detect_failed_masks=True), 4) > 0.99
 
 
 def test_frames_without_liquid_stay_empty_between_others() -> None:
     scene = MovingBall()
     scene.changed = {(view, t): "empty" for view in scene.train for t in (0, 1, 5)}
-    fields = signed_distance_fields(scene, 24, find_failures=True)
+    fields = signed_distance_fields(scene, 24, detect_failed_masks=True)
     assert [(phi < 0).any() for phi in fields.phi] == [False, False, True, True, True, False, True, True, True]
 
 
@@ -109,7 +109,7 @@ def test_no_liquid_at_all_is_one_line() -> None:
 def test_full_masks_everywhere_are_one_line_and_in_one_view_no_matter() -> None:
     scene = MovingBall(n_frames=3)
     scene.changed = {("0", t): "full" for t in range(3)}
-    assert inside(scene, signed_distance_fields(scene, 24, find_failures=True), 1) > 0.99
+    assert inside(scene, signed_distance_fields(scene, 24, detect_failed_masks=True), 1) > 0.99
     scene.changed = {(view, t): "full" for view in scene.train for t in range(3)}
     with pytest.raises(SplashbenchError, match="moving_ball: every liquid mask of the training views is full"):
         Silhouettes(scene)
@@ -117,7 +117,7 @@ def test_full_masks_everywhere_are_one_line_and_in_one_view_no_matter() -> None:
 
 def test_two_views_make_a_hull() -> None:
     scene = MovingBall(views=2)
-    fields = signed_distance_fields(scene, 32, find_failures=True)
+    fields = signed_distance_fields(scene, 32, detect_failed_masks=True)
     assert min(inside(scene, fields, t) for t in range(scene.n_frames)) > 0.99
 
 
