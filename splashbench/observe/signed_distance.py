@@ -100,7 +100,9 @@ def signed_distance_fields(
 
     The grid spans the box around the hulls of all frames with 10% padding, with `cells_longest_axis` cubic cells
     along its longest side. container: see `signed_distance_frames`. detect_failed_masks: whether masks that miss large
-    parts of the liquid are looked for and replaced (failures.py). Raises SplashbenchError when the masks have no common hull.
+    parts of the liquid are looked for and replaced (failures.py).
+
+    Raises SplashbenchError when the masks have no common hull.
     """
     silhouettes = Silhouettes(scene, views)
     if detect_failed_masks:
