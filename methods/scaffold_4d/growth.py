@@ -1,8 +1,8 @@
 """Anchors grow in cells of space-time where the loss pulls, whether what is there shows for long or for a moment.
 
 A Gaussian that shows for a moment is seen in few steps, and where it is faint its gradient is small. So the mean of its
-screen gradient is taken with the weights w = fading sigma (Cho et al. 2024, "dynamic-aware anchor growing"): w adds up
-to the same for a short and a long life, and the children count that have enough of it. A cell is one frame long; its
+screen gradient is taken with the weights w = fading sigma (Cho et al. 2024, "dynamic-aware anchor growing"). w adds up
+to the same for a short and a long life. Children count once they have enough of it. A cell is one frame long; its
 size in space and the thresholds are those of static anchors (scaffold_gs/growth.py), but the finer a level, the more
 of its candidates are kept.
 """

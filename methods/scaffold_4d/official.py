@@ -8,7 +8,7 @@ color_mlp.pt and flow_mlp.pt, which torch.jit traced; and cfg_args. Against scaf
     without `--temporal_opacity ours` alpha = rho exp(-(t_k - tau)^2 sigma), without --use_flow nothing moves
     anchors that do not show in the image by themselves, with axes s[0:3], give no Gaussians
 
-Frames with focal lengths leave its angles of view at -1 rad, and footprints are projected with these: as if every
+Frames with focal lengths leave its angles of view at -1 rad, and footprints are projected with these. It is as if every
 Gaussian stood at the one slope -1.3 tan(1/2) in front of a lens of focal length size / (2 tan(1/2)) pixels. Its
 models are fitted so, and look wrong in any other way.
 """

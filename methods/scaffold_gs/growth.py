@@ -1,8 +1,8 @@
 """Anchors grow where the fit pulls at their Gaussians, and vanish where nothing is drawn (Lu et al. 2024, Sec. 3.3).
 
-Growing: a voxel becomes an anchor where a Gaussian within it has a mean gradient of its 2-D mean above a threshold
-tau_g and there is no anchor yet, at three levels: level m = 0, 1, 2 has voxels of 16, 4 and 1 times the finest size and
-the threshold 2^m tau_g (cells.py). Pruning: an anchor goes if its Gaussians' opacities, averaged over the steps, add up
+Growing: a voxel without an anchor becomes one where a Gaussian within it has a mean gradient of its 2-D mean above a
+threshold tau_g. There are three levels: level m = 0, 1, 2 has voxels of 16, 4 and 1 times the finest size and the
+threshold 2^m tau_g (cells.py). Pruning: an anchor goes if its Gaussians' opacities, averaged over the steps, add up
 to almost nothing. `AnchorGrowth` is shared with anchors in space-time; `Growth` is that of the static ones.
 """
 

@@ -7,8 +7,8 @@ With anchor position a, log-scales l [6], offsets o [K, 3], feature f [32], view
     colour   = sigmoid(MLP([f, d]))
     mean     = a + o * exp(l[0:3])
 
-Two departures on request: with `base_color` the first three feature channels are added to the colour's logits and start
-at the point's own colour, so that hundreds of iterations suffice instead of tens of thousands; without
+Two departures on request. With `base_color` the first three feature channels are added to the colour's logits and start
+at the point's own colour, so that hundreds of iterations suffice instead of tens of thousands. Without
 `view_dependent_shape` opacity and shape see no view direction.
 """
 

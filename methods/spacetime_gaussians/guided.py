@@ -1,9 +1,9 @@
 """Guided sampling: new Gaussians along the rays of what the worst view gets wrong (Li et al. 2024, Sec. 3.4).
 
 Points at the start cover badly what is seen seldom or is far away, and cloning does not reach there. Of some training
-photographs the one with the largest error is taken, then its patches with the largest errors; along the ray through
-each patch's middle, Gaussians of the patch's colour and size are placed at random depths within those of the Gaussians
-that the view shows. They appear at the photograph's time.
+photographs the one with the largest error is taken, then its patches with the largest errors. Gaussians of a patch's
+colour and size are placed along the ray through its middle, at random depths within those that the view shows. They
+appear at the photograph's time.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Dense inverse depth of every clean plate by plane sweep: at the right depth, other views show a pixel's colour.
 
-For planes of constant depth the other plates are warped into a view by homographies; each plane costs the colour
+For planes of constant depth the other plates are warped into a view by homographies. Each plane costs the colour
 difference to the two views that agree best, so that a view to which the pixel is hidden does no harm. The costs are
 smoothed along the image's own edges (cost-volume filtering, Hosni et al. 2011), and the cheapest plane wins.
 """

@@ -5,9 +5,9 @@ the gradient by its projection (u, v) is
 
     dL/du = h_x z / fx,    dL/dv = h_y z / fy:
 
-moving the mean parallel to the image moves its projection by f / z and leaves its footprint alone, but for the small
-terms off the optical axis, so these two components hold dL/d(u, v) without the footprint's share, which lies in h_z.
-(The projection's pseudo-inverse would mix h_z in.) Gradients are taken in normalised device coordinates, W/2 and H/2
+moving the mean parallel to the image moves its projection by f / z and leaves its footprint alone, but for small terms
+off the optical axis. So these two components hold dL/d(u, v) without the footprint's share, which lies in h_z. (The
+projection's pseudo-inverse would mix h_z in.) Gradients are taken in normalised device coordinates, W/2 and H/2
 pixels a unit, in which the published thresholds are given.
 """
 

@@ -1,9 +1,9 @@
 """Masks that miss large parts of the liquid, found by what the other views see.
 
 The hull of the other views is projected into a view, without what the container hides there. Where it covers pixels
-that the mask leaves dry, either the hull is wrong there (it always is somewhere, behind the liquid and in front) or
-the mask is. Over the sequence each patch of the image tells how far the hull may be believed there: by the share of
-frames, among those in which it is covered, in which the mask agrees.
+that the mask leaves dry, either the hull is wrong or the mask is. (The hull always is somewhere, behind the liquid and
+in front.) How far to believe the hull is decided per patch of the image: by the share of frames, among those in which
+the hull covers it, in which the mask agrees.
 """
 
 from __future__ import annotations

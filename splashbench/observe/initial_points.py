@@ -26,9 +26,10 @@ _SEED = 0
 def initial_points(scene: Scene | TrainingScene, liquid_per_frame: int) -> InitialPoints:
     """The points of `scene`, with at most `liquid_per_frame` of the liquid in each timestep; 0 leaves the liquid out.
 
-    A point of the liquid is a node of the hull's grid within half a voxel of its surface, in the median of the colours
-    that the training views have at its place, whatever is in front of it. Raises SplashbenchError when the masks have
-    no common hull.
+    A point of the liquid is a node of the hull's grid within half a voxel of its surface. Its colour is the median of
+    those that the training views have at its place, whatever is in front of it.
+
+    Raises SplashbenchError when the masks have no common hull.
     """
     sparse = scene.initial_points()
     static = np.zeros((0, 6)) if sparse is None else sparse[:, :6].astype(np.float64)

@@ -1,7 +1,7 @@
 """Decoding carriers into Gaussians (paper, "Decoding Carriers into Gaussians", Eqs. child_position and sdf_opacity).
 
-Heads shared by all carriers and frames turn a carrier's feature f into K children in its frame A = F diag(s): offset,
-scale and opacity by linear heads, colour by a two-layer perceptron that also sees the viewing direction.
+Heads shared by all carriers and frames turn a carrier's feature f into K children in its frame A = F diag(s). Offset,
+scale and opacity come from linear heads, colour from a two-layer perceptron that also sees the viewing direction.
 `Decoder.forward` is the definition, in plain torch; `Decoder.decode` computes the same, on the CPU by the kernel of
 splashbench_methods.splashsplat.kernel.decode.
 """

@@ -1,8 +1,8 @@
 """Adam over the rows of tables of which each iteration touches only a few.
 
 An iteration sees the carriers of one frame. Dense Adam would move every carrier of the sequence at every iteration,
-by momentum alone; here a row moves, and its moments decay, only when it has a gradient (Adam, Kingma and Ba 2015,
-with a step count per row).
+by momentum alone. Here a row moves, and its moments decay, only when it has a gradient (Adam, Kingma and Ba 2015, with
+a step count per row).
 """
 
 from __future__ import annotations

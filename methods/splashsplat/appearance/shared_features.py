@@ -1,9 +1,9 @@
 """Features that carriers share while they are fitted: what is near in space and time looks alike.
 
-A carrier lasts a few frames and a handful of photographs show it; alone, it learns what it looks like from these. So
-its feature is a sum: its own part, and one for each size of cell, which it shares with every carrier that was born in
-the same cell of space and time. A photograph then teaches neighbours, too, and what no photograph tells of one carrier
-it has from them. At the end the sum is kept: decoder and files know nothing of the parts. Not in the paper.
+A carrier lasts a few frames, and a handful of photographs show it. Alone, it would learn its looks from these only. So
+its feature is a sum: its own part, and one for each size of cell. It shares that one with every carrier that was born
+in the same cell of space and time. A photograph then teaches neighbours, too. At the end the sum replaces the parts:
+decoder and files know nothing of them. Not in the paper.
 """
 
 from __future__ import annotations

@@ -26,8 +26,11 @@ _SAME_FRAME = 1e-4
 
 
 def locate(times: np.ndarray, time: float) -> tuple[int, float]:
-    """Frame nearest to `time`, and how far from it `time` lies, clamped to the sequence: a fraction of the step to the
-    next frame where it is positive, in (0, 0.5], of the step before where it is negative, in (-0.5, 0)."""
+    """Frame nearest to `time`, and how far from it `time` lies, clamped to the sequence.
+
+    The distance is a fraction of a step: of the one to the next frame where positive, in (0, 0.5], of the one before
+    where negative, in (-0.5, 0).
+    """
     times = np.asarray(times, dtype=np.float64)
     if len(times) == 1 or time <= times[0]:
         return 0, 0.0

@@ -29,8 +29,8 @@ class CarrierSettings:
     """Distances in transport voxels.
 
     lifetime: frames that a carrier lasts on average, None for as long as it stays in the liquid. A new one takes its
-    place and has its own appearance to learn: what a carrier shows, and whether it is of the liquid at all or of the
-    phantom volume of the hull, changes within a few frames. `variant` picks the paper's ablations; "full" is the
+    place and learns an appearance of its own. What a carrier shows changes within a few frames, and so does whether it
+    is of the liquid or of the hull's phantom volume. `variant` picks the paper's ablations; "full" is the
     method. "no_resampling": carriers of the first liquid only. "per_frame": new ones in every frame, none moved.
     "flip": carriers of the first liquid, moved by a simulation that looks at no other frame (flip/).
     """

@@ -1,11 +1,11 @@
 """The pool: liquid that rests in a container is level (hydrostatics).
 
 Silhouettes say where liquid may be, not where it is: over a pool the visual hull is a dome, as high as the cameras look
-down. Two things are known of a pool beyond its silhouettes: it fills the container up to one height, and the outline
-of its surface is where that surface meets the container's wall. So the level is the height that best separates the
-part of the inner wall that masks cover from the part that they leave free, found per frame, and
-- below the level the container is full,
-- above it only that part of the hull stays which a view needs to explain its mask: what every view sees in front of
+down. Two things are known of a pool beyond its silhouettes. It fills the container up to one height, and the outline
+of its surface is where that surface meets the container's wall. So the level of a frame is the height that best
+separates the part of the inner wall that masks cover from the part that they leave free.
+- Below the level the container is full.
+- Above it only that part of the hull stays which a view needs to explain its mask. What every view sees in front of
   the pool is a phantom.
 Not in the paper. Needs the container's mesh and the direction of gravity.
 """
