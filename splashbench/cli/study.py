@@ -98,13 +98,13 @@ def run(arguments: argparse.Namespace) -> int:
     command = _command(arguments)
     files = write_report(table, arguments.out, command)
     failed = sum(len(row.failed) for row in table.rows)
-    reused = f", {tally.kept} reused" if tally.kept else ""
+    reused = f", {tally.reused} reused" if tally.reused else ""
     say(f"{tally.made} runs made{reused}; {len(table.rows)} rows, {failed} failed runs")
     for file in files:
         say(f"wrote {file}")
     if arguments.json:
         emit(
-            {"out": str(arguments.out), "made": tally.made, "kept": tally.kept, "failed": failed}
+            {"out": str(arguments.out), "made": tally.made, "kept": tally.reused, "failed": failed}
             | {"files": [str(file) for file in files], "table": as_json(table, command)}
         )
     return 0

@@ -111,6 +111,6 @@ def _label_rows(grid: NDArray, submissions: Sequence[Any]) -> None:
             text = f"{identity.method} ({identity.preset}, seed {identity.seed}) failed: {status}. {submission.reason}"
             text = shorten(text, _REASON_CHARACTERS, placeholder=" ...")
             note = grid[row, 0].text(0, 0.5, text, transform=grid[row, 0].transAxes, va="center", color="#A00000")
-            # It runs on over the neighbouring cells and must not widen its own.
+            # The text extends over the neighbouring cells and must not widen its cell.
             note.set_in_layout(False)
             row += 1

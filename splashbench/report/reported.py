@@ -1,6 +1,6 @@
-"""The paper's own figures for one scene, to stand below a leaderboard's table and never in it.
+"""The paper's figures for one scene, below a leaderboard's table and never in it.
 
-Only NeuroFluid's scenes have figures of their own there (Tables 3 and S4); of real scenes it prints means.
+The paper gives figures scene by scene only for NeuroFluid's scenes (Tables 3 and S4); of real scenes it gives means.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _FIGURES = [METRICS[name] for name in ("psnr", "ssim", "lpips", "jitter_error")]
 def reported_table(scene: str) -> list[str]:
     """A line of introduction and the table, in Markdown; nothing for a scene of which the paper prints nothing.
 
-    Scenes are known by name, in upper or lower case: downloads differ in that.
+    Scenes are matched by name whatever its case, which differs between downloads.
     """
     from splashbench.paper_figures import paper_rows
 

@@ -41,7 +41,7 @@ def load_results(location: Path) -> list[ResultFile]:
         source = ResultFile(path.relative_to(root).as_posix(), _plausible(path, Result.load(path)))
         digests = source.result.digests
         key = (digests.scene, digests.submission, digests.protocol)
-        if key not in by_digests or _known(source.result) > _known(by_digests[key].result):
+        if key not in by_digests or _figure_count(source.result) > _figure_count(by_digests[key].result):
             by_digests[key] = source
     sources = sorted(by_digests.values(), key=lambda source: (*_order(source.result), source.path))
     _refuse_repeats(sources)
@@ -72,7 +72,7 @@ def _plausible(path: Path, result: Result) -> Result:
     return result
 
 
-def _known(result: Result) -> int:
+def _figure_count(result: Result) -> int:
     return sum(metric.value is not None for metric in result.metrics.values())
 
 

@@ -63,7 +63,7 @@ class SignedDistance:
         return self.phi.shape[0]
 
     def save(self, path: Path) -> None:
-        """Write an .npz without pickles, whole or not at all."""
+        """Write an .npz without pickles, atomically."""
         with atomic_path(path) as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, phi=self.phi, origin=self.origin, voxel=self.voxel)
 

@@ -1,7 +1,7 @@
 """The files of a scene: the released layout's `*_meta.json` (Dynamic 3D Gaussians) and our optional scene.json.
 
 The released layout is canonical (docs/scene_format.md), so the real dataset needs no conversion. scene.json holds
-what the release lacks; a scene without it is whole all the same.
+what the release lacks; it is optional.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from splashbench.files import MAX_PIXELS, read_json, validate_model
 
 # A camera folder and a file in it, and nothing that could lead out of `ims/`.
 _IMAGE_PATH = re.compile(r"[A-Za-z0-9_][\w-]*/[A-Za-z0-9_][\w.-]*\.(?:jpg|jpeg|png|JPG|PNG)")
-# The cameras are bolted down; anything beyond rounding is a moving camera, which nothing here supports.
+# Cameras are fixed. A difference beyond rounding is a moving camera, which is not supported.
 _STATIC_TOLERANCE = 1e-6
 # Pixels, scene units or seconds: nothing real comes near, and sums and squares stay finite.
 LARGEST = 1e9
@@ -97,7 +97,7 @@ def static_matrices(path: Path, key: str, values: list, shape: tuple[int, ...]) 
 
 
 class SceneMeta(BaseModel):
-    """scene.json: what the released layout cannot say. Every field may be null: what is not known stays unknown.
+    """scene.json: what the released layout lacks. Every field may be null, for what is unknown.
 
     times: seconds of each timestep on the reference camera's clock. camera_times: each camera's own exposure times.
     sizes: image (width, height) per camera. metres_per_unit: metric scale. gravity: unit vector along which things

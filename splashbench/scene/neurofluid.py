@@ -198,7 +198,7 @@ class NeuroFluidSource(SceneSource):
         return arrays["pos"].astype(np.float32), None if velocities is None else velocities.astype(np.float32)
 
     def faults(self) -> list[str]:
-        """Views of different instants, told by their particles, and times that the velocities contradict."""
+        """Faults: views of different instants, by their particles, and times that contradict the velocities."""
         try:
             true = self.truth_particles() if self.truth_files() else None
         except SplashbenchError:

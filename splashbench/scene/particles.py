@@ -47,7 +47,7 @@ class Particles:
         return self.positions[t][self.active[t]]
 
     def save(self, path: Path) -> None:
-        """Write an .npz without pickles, whole or not at all."""
+        """Write an .npz without pickles, atomically."""
         arrays: dict[str, NDArray] = {"positions": self.positions, "active": self.active}
         if self.velocities is not None:
             arrays["velocities"] = self.velocities

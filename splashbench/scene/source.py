@@ -89,7 +89,7 @@ class SceneSource(ABC):
         return hashlib.sha256(json.dumps(entries).encode()).hexdigest() if entries else None
 
     def faults(self) -> list[str]:
-        """What contradicts itself in files that are whole one by one, a line each."""
+        """Contradictions between files that are valid one by one, a line each."""
         return []
 
     def _read_meta(self) -> SceneMeta | None:

@@ -54,7 +54,7 @@ class Tally:
     """How many runs were made now, and how many existed before."""
 
     made: int = 0
-    kept: int = 0
+    reused: int = 0
 
 
 def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tally:

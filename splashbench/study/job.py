@@ -95,7 +95,7 @@ class Store:
         return self.runs / f"{digest[:16]}.json"
 
     def reference_path(self, digest: str) -> Path:
-        """The submission of a reference run, kept to score others against."""
+        """Folder of the submission of a reference run, which other runs are scored against."""
         return self.cache / "references" / digest[:16]
 
     def reference(self, digest: str) -> Submission | None:

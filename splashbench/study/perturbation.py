@@ -1,9 +1,9 @@
 """Worse liquid masks: a stand-in for those of an automatic segmentation (paper, supplement, "Annotation Protocol").
 
-The paper compares raw SAM3 masks with refined ones: 8.6% of the raw masks are empty, their mean IoU is 0.772 and the
-median 0.967, and refining is almost entirely additive. So a mask here loses a part and gains none, which makes the
-IoU with the whole mask the share of pixels that are left. What is lost lies low in the image: the falling stream is
-found and the water that stands below is not. The paper gives no correlation between masks; here frames that are hard
+The paper compares raw SAM3 masks with refined ones. 8.6% of the raw masks are empty, their mean IoU is 0.772 and the
+median 0.967, and refining adds almost only pixels. So a mask here loses a part and gains none, and the IoU with the
+original mask is the share of pixels that remain. What is lost lies low in the image: an automatic segmentation finds
+the falling stream and misses the water below. The paper gives no correlation between masks. Here frames that are hard
 in one view tend to be hard in the others and a moment later.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import gaussian_filter1d
 
-#: (camera, timestep) pairs in the order of bool [cameras, frames], of which those with liquid count -> share kept.
+#: bool [cameras, frames], true for masks with liquid -> share of each mask's pixels that remain, [cameras, frames].
 Draw = Callable[[NDArray[np.bool_], np.random.Generator], NDArray[np.float64]]
 
 # Most masks need almost no correction: this share of them loses less than _SLIGHT, evenly spread. With the paper's
@@ -25,7 +25,7 @@ Draw = Callable[[NDArray[np.bool_], np.random.Generator], NDArray[np.float64]]
 _ACCEPTED = 0.66
 _SLIGHT = 0.04
 _MOST_DAMAGED, _LEAST_DAMAGED = 0.02, 1.0 - _SLIGHT
-# Correlation of hardness between views of one frame, and how long it lasts, as a share of the sequence.
+# Correlation of hardness between views of one frame; its duration as a share of the sequence.
 _SHARED = 0.5
 _LASTING = 0.06
 _TILT_DEGREES = 30.0
@@ -57,7 +57,7 @@ Perturbation = Annotated[EmptyMasks | MissingParts, Field(discriminator="kind")]
 
 
 def empty_masks(share: float) -> Draw:
-    """Keeps nothing of `share` of the masks with liquid, rounded to whole masks, and all of the others."""
+    """Empties `share` of the masks with liquid, rounded to a number of masks, and leaves the others as they are."""
 
     def draw(wet: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float64]:
         shares = np.ones(wet.shape)
@@ -68,7 +68,7 @@ def empty_masks(share: float) -> Draw:
 
 
 def missing_parts(target_iou: float) -> Draw:
-    """Keeps almost all of most masks and much less of the others, `target_iou` on average over masks with liquid."""
+    """Takes little from most masks and much from the others, down to `target_iou` on average over masks with liquid."""
     slight = 1 - _SLIGHT / 2
     accepted = _ACCEPTED
     if target_iou < 1 and target_iou > accepted * slight + (1 - accepted) * _LEAST_DAMAGED:
@@ -78,8 +78,8 @@ def missing_parts(target_iou: float) -> Draw:
     damaged = (target_iou - accepted * slight) / (1 - accepted) if accepted < 1 else _LEAST_DAMAGED
     reach = min(damaged - _MOST_DAMAGED, _LEAST_DAMAGED - damaged)
 
-    def share_kept(quantile: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of masks by quantile of hardness, 0 the hardest."""
+    def remaining(quantile: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Share of pixels that remains, by the mask's quantile of hardness; 0 is the hardest."""
         among_damaged = quantile / max(1 - accepted, 1e-9)
         among_accepted = (quantile - (1 - accepted)) / max(accepted, 1e-9)
         return np.where(
@@ -91,7 +91,7 @@ def missing_parts(target_iou: float) -> Draw:
     def draw(wet: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float64]:
         shares = np.ones(wet.shape)
         quantiles = (_hardness_ranks(wet, rng) + 0.5) / max(1, wet.sum())
-        shares[wet] = share_kept(quantiles) if target_iou < 1 else 1.0
+        shares[wet] = remaining(quantiles) if target_iou < 1 else 1.0
         return shares
 
     return draw

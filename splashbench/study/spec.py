@@ -46,7 +46,7 @@ class SceneEntry(_Model):
 class StudyVariant(_Model):
     """One row of the table: what it changes. `paper`: its name in leaderboards/paper.csv.
 
-    method: another one than the study's, with its own preset (the first, unless named) and settings; `base` is not its.
+    method: another one than the study's, with its own preset (by default its first) and settings, without `base`.
 
     train_views: a number (nested subsets that bracket the test views) or the names of the training views kept.
     withheld: timesteps that the method does not see, and that alone are scored (submission/withheld.py).
@@ -78,7 +78,7 @@ class Paper(_Model):
 
 
 class StudySpec(_Model):
-    """A whole study. `base`: settings of every row of `method`, on top of its preset: the budget, stated once.
+    """A whole study. `base`: the budget, settings of every row of `method` on top of its preset.
 
     reference: false in TOML leaves the control out. timeout_seconds: for each fit, and again for each rendering.
     """

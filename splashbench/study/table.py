@@ -68,7 +68,7 @@ class StudyRun:
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure of a row; None where it cannot be said.
+    """One figure of a row; None where it is undefined.
 
     mean, std: over seeds, of the means over scenes; seeds: these means. difference, difference_std: to the baseline.
     """
@@ -104,12 +104,12 @@ class TableRow:
 
     @property
     def mixed(self) -> bool:
-        """Whether it is of a mixed method, whose liquid the protocol's filter picks out; known from its results."""
+        """Whether the method is mixed, by its results: the protocol's filter selects such a method's liquid."""
         return any(run.result is not None and run.result.mixed for run in self.runs)
 
     @property
     def complete(self) -> bool:
-        """Whether every run of the row came through."""
+        """Whether every run of the row succeeded."""
         return self.count("ok") == len(self.runs)
 
 
@@ -132,7 +132,7 @@ class Table:
 
     @property
     def filtered(self) -> bool:
-        """Whether some figure rests on the filter that picks out the liquid of mixed methods."""
+        """Whether some figure rests on the filter that selects the liquid of mixed methods."""
         named = any(metric_of(name).filtered for name in self.plan.spec.metrics)
         return named and any(row.mixed for row in self.rows)
 

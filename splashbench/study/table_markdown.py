@@ -16,7 +16,7 @@ from splashbench.study.table import NOT_RUN, Table, TableRow
 
 
 def to_markdown(table: Table, command: str) -> str:
-    """The whole document. `command` makes the study again."""
+    """The whole document. `command` repeats the study."""
     spec = table.plan.spec
     parts = [
         f"# Study {spec.name}" + (f": {one_line(spec.title)}" if spec.title else ""),

@@ -12,7 +12,7 @@ from splashbench.score.notation import NO_FIGURE, filter_mark, label, shown, sho
     ("name", "value", "text"),
     [
         ("psnr", 20.126, "20.13"),
-        ("peak_memory_bytes", 3 * 2**20, "3"),
+        ("peak_memory_bytes", 300 * 2**20, "300"),
         ("peak_device_memory_bytes", 1.5 * 2**30, "1536"),
         ("storage_bytes", 2_500_000, "2.50"),
         ("dynamic_bytes", 1_234_567, "1.23"),

@@ -24,7 +24,7 @@ FORMATS: dict[str, Callable[[Export], None]] = {
     "blender": write_blender,
     "colmap": write_colmap,
 }
-# A step may differ from the mean by this share of it before someone who counts frames is told.
+# Largest deviation of a step from the mean, as a share of it, without a remark for layouts that count frames.
 _UNEVEN = 0.02
 _PIXEL = 0.01
 _OFF_CENTRE = 1.0

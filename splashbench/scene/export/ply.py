@@ -16,7 +16,7 @@ _TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 def write_ply(path: Path, points: NDArray[np.float64]) -> None:
-    """Write `points` [N, 6] (x, y, z, r, g, b in [0, 1]), whole or not at all."""
+    """Write `points` [N, 6] (x, y, z, r, g, b in [0, 1]), atomically."""
     vertices = np.zeros(len(points), _VERTEX)
     for column, name in enumerate(("x", "y", "z")):
         vertices[name] = points[:, column]
