@@ -1,5 +1,6 @@
 """Compare two methods on one scene: run both, score both against the same reference, draw the leaderboard."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -28,17 +29,19 @@ def main(out: Path, methods: tuple[str, ...] = METHODS) -> list[Path]:
         )
         for name, preset, settings in [("nothing", "quick", {"iterations": 50}), *((m, None, {}) for m in methods)]
     }
+    # Results of an earlier run of this script would count as a second run of the same seed.
+    results = out / "compared"
+    shutil.rmtree(results, ignore_errors=True)
     # Signed distances from the training masks, computed once for all.
     fields = shared_fields(scene)
     for submission in submissions.values():
-        result = score_submission(scene, submission, submissions["nothing"], fields=fields)
-        result.save(out / "leaderboard_results")
-        for name in ("psnr", "dpsnr_bg", "miou"):
-            print(f"{result.method:16} {name:9} {result.value(name):8.3f}")
+        score_submission(scene, submission, submissions["nothing"], fields=fields).save(results)
 
-    sources = load_results(out / "leaderboard_results")
+    sources = load_results(results)
+    table = leaderboard_table(sources)
+    print(table[["method", "psnr", "dpsnr_bg", "miou"]])
     (out / "leaderboard").mkdir(exist_ok=True)
-    files = write_leaderboard(leaderboard_table(sources), sources, out / "leaderboard")
+    files = write_leaderboard(table, sources, out / "leaderboard")
     files += speed_accuracy_chart(sources, out / "leaderboard")
     print("wrote", *files)
     return files

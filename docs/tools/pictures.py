@@ -112,7 +112,7 @@ def test_view() -> list[Path]:
     columns = [("truth", scene.image(VIEW, FRAME), mask.astype(np.float32))]
     columns += [(METHODS[n], s.rendering(VIEW, FRAME), s.alpha(VIEW, FRAME)) for n, s in submissions.items()]
     height = (crop[0].stop - crop[0].start) / (crop[1].stop - crop[1].start)
-    figure = Figure(figsize=(9, 6 * height + 0.5), layout="constrained")
+    figure = Figure(figsize=(9, 2 * 2.85 * height + 0.3), layout="constrained")
     grid = figure.subplots(2, len(columns))
     for (title, picture, opacity), (top, bottom) in zip(columns, grid.T):
         bare(top, title).imshow(picture[crop], interpolation="lanczos")
@@ -241,10 +241,10 @@ def tutorial() -> list[Path]:
     made(runs[1], "run", "hull_points", str(SCENE), str(runs[1]))
     runs += [submissions["splashsplat"].directory]
     results, sheet = WORK / "results", WORK / "sheet.png"
-    paths = [str(path) for path in (*runs, submissions["scaffold_4d"].directory)]
+    paths = [str(path) for path in runs]
     scored = ["--scene", str(SCENE), "--out", str(results), "--reference", paths[0]]
     made(results, "score", *paths, *scored)
-    contact_sheet(scene, [Submission.open(path) for path in runs], sheet, [FRAME // 2, FRAME])
+    contact_sheet(scene, [Submission.open(path) for path in runs[1:]], sheet, [FRAME // 2, FRAME])
     with_chart = made(WORK / "leaderboard", "leaderboard", str(results), str(WORK / "leaderboard"))
     return [
         all_cameras(scene),

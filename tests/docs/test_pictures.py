@@ -1,0 +1,40 @@
+"""The pictures of README.md are small, and its chart is what the committed leaderboard gives."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README_BYTES = 400_000
+
+
+def test_the_first_pages_pictures_are_small() -> None:
+    pictures = [ROOT / "docs" / "images" / name for name in ("test_view.png", "speed_accuracy.png")]
+    assert sum(path.stat().st_size for path in pictures) < README_BYTES
+    assert all(path.name in (ROOT / "README.md").read_text(encoding="utf-8") for path in pictures)
+
+
+def test_the_chart_is_drawn_from_the_leaderboard(tmp_path: Path) -> None:
+    pictures = runpy.run_path(str(ROOT / "docs" / "tools" / "pictures.py"))
+    chart: Any = pictures["chart"]
+    chart.__globals__["IMAGES"] = tmp_path
+    (path,) = chart()
+    assert imageio.imread(path).std() > 10
+
+
+def test_links_of_the_site() -> None:
+    pytest.importorskip("mkdocs", reason="comes with the extra [docs]")
+    site = runpy.run_path(str(ROOT / "docs" / "tools" / "site.py"))
+    rewritten: Any = site["rewritten"]
+    text = "[a](docs/protocol.md#rules) [b](CONTRIBUTING.md) [c](Makefile) [d](#here) ![e](docs/images/x.png)"
+    expected = "[a](protocol.md#rules) [b](contributing.md) c [d](#here) ![e](images/x.png)"
+    assert rewritten(text, "README.md", "index.md") == expected
+    text = "[a](../methods/splashsplat/README.md) [b](../README.md) `[c](d.md)`\n\n[e](../examples/add_a_method.py)\n"
+    shown = rewritten(text, "docs/reference.md", "reference.md")
+    assert shown.startswith("[a](methods/splashsplat.md) [b](index.md)")
+    assert "class NearestView(Method)" in shown
