@@ -5,14 +5,19 @@ import signal
 import subprocess
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from splashbench.harness.conformance import model
 from splashbench.harness.conformance.recording import OpeningWatch
+from splashbench.harness.conformance.report import Verdict, judge
 from splashbench.harness.conformance.scene_copies import empty_masks, hidden, keep_first_frame
 from splashbench.harness.conformance.stopping import StoppedRun, as_pairs, signal_faults
 from splashbench.harness.conformance.storage import storage_faults
+from splashbench.harness.conformance.subject import Answer
+from splashbench.harness.conformance.views import RenderedView
 from splashbench.harness.runner import parse_overrides
 from splashbench.scene import Scene
 
@@ -78,6 +83,36 @@ def test_openings_are_seen_from_any_process(tmp_path: Path) -> None:
     assert openings.opened == [tmp_path / "folder"]
     files["read"].read_text()
     assert openings.opened == [tmp_path / "folder"]
+
+
+def test_openings_that_may_have_been_missed_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import inotify_simple
+
+    overflow = inotify_simple.Event(-1, inotify_simple.flags.Q_OVERFLOW, 0, "")
+    monkeypatch.setattr(inotify_simple.INotify, "read", lambda self, timeout: [overflow])
+    with OpeningWatch([tmp_path / "file"]) as openings:
+        assert openings.complete
+    assert not openings.complete
+    with OpeningWatch([tmp_path / "no folder" / "file"]) as openings:
+        assert not openings.complete
+
+
+def test_a_fault_of_the_loaded_model_alone_fails_the_check() -> None:
+    good, bad = RenderedView(kind="test", digest="1"), RenderedView(kind="test", fault="camera 6: NaN")
+    evidence = SimpleNamespace(fitted=Answer(views={"a": good}), loaded=Answer(views={"a": bad}))
+    assert model.views.judgement(evidence) == (Verdict.FAILED, "camera 6: NaN")
+    evidence.loaded = Answer(views={"a": good}, window_fault="the part around the middle")
+    assert model.views.judgement(evidence) == (Verdict.OK, "1 view")
+    assert model.principal_point.judgement(evidence) == (Verdict.FAILED, "the part around the middle")
+    evidence.fitted = Answer(ended_in="fit", reason="no memory")
+    finding = model.views.finding(evidence)
+    assert (finding.verdict, finding.detail) == (Verdict.NOT_TESTED, "the fit ended in fit: no memory")
+
+
+def test_a_finding_names_three_faults_and_counts_the_rest() -> None:
+    assert judge(list("abc"), "fine") == (Verdict.FAILED, "a; b; c")
+    assert judge(list("abcde"), "fine", Verdict.WARNING) == (Verdict.WARNING, "a; b; c (and 2 more)")
+    assert judge([], "fine", Verdict.WARNING) == (Verdict.OK, "fine")
 
 
 def test_hiding_leaves_a_method_what_it_may_see(balls_copy: Path, balls: Scene, tmp_path: Path) -> None:
