@@ -20,7 +20,7 @@ KERNEL_FOLDERS := splashbench/native splashbench/*/kernel methods/*/kernel
 KERNEL := setup.py build_kernel.py build_compilers.py $(wildcard $(foreach folder,$(KERNEL_FOLDERS),$(folder)/*.cpp $(folder)/*.h))
 
 help:
-	@echo "make demo      film a made-up pour, reconstruct it and score it, into demo_output/"
+	@echo "make demo      film a synthetic pour, reconstruct it and score it, into demo_output/"
 	@echo "make test      run the tests, the slow ones left out"
 	@echo "make test-all  run every test (those without a CUDA device to run on skip)"
 	@echo "make lint      check style and types"

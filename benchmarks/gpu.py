@@ -3,13 +3,16 @@
     python benchmarks/gpu.py [--json FILE] [--repeats N]
 
 One command for everything that a machine without a GPU cannot show. It runs the tests marked cuda, then renders scenes
-iii, i and ii of benchmarks/render.py with both backends in turn. Without a GPU, or without gsplat 1.5.3, it says so in
-one line and exits 1. So it does after the table where a test failed or an image differs by more than 1e-3.
+iii, i and ii of render_scenes.py with both backends in turn. Without a GPU, or without gsplat 1.5.3, it says so in one
+line and exits 1. It also exits 1, after the table, where a test failed or an image differs by more than 1e-3.
 
-The JSON has `tests` (passed, summary), per scene `cpu` and `cuda` (forward_ms, backward_ms: medians over the rounds),
-`speedup` (CPU time over CUDA time, both passes; median over the rounds), `image_difference` (largest, color and
-opacity, over the `smooth_share` of the pixels where rounding does not decide what is drawn), and what it ran on. A time
-includes the wait for the device. CPU tensors stay on the CPU and CUDA tensors on the device: no copies are timed.
+The JSON has `tests` (passed, summary), what it ran on, and per scene
+
+cpu, cuda           forward_ms and backward_ms, medians over the rounds. A time includes the wait for the device, and no
+                    copies: CPU tensors stay on the CPU, CUDA tensors on the device.
+speedup             CPU time over CUDA time, both passes; median over the rounds.
+image_difference    the largest one, of color and opacity, over the pixels where rounding does not decide what is drawn.
+smooth_share        the share of these pixels.
 """
 
 from __future__ import annotations

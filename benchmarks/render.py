@@ -3,8 +3,8 @@
     python benchmarks/render.py [--prototype DIR] [--json FILE] [--repeats N] [--quick]
 
 A time is that of one forward and backward pass through torch's autograd, on two threads and for fixed random gradients
-of both images. What is compared takes turns (A B A B ...), after two rounds that do not count. A ratio is the median
-over the rounds of A's time over B's in the same round, so that a slow spell of a shared machine hits both. The JSON has
+of both images. What is compared takes turns (A B A B ...), after two rounds that do not count. Each round gives a ratio
+of A's time over B's, and their median counts: a slow spell of a shared machine hits both. The JSON has
 
 prototype_ratio     ours / the C++ prototype in DIR, which is compiled here and now, on scenes iii, i and ii. The
                     prototype takes covariances, made outside the clock.

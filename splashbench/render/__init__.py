@@ -9,9 +9,8 @@ What a fit can leave out, it does not pay for:
   do, at no cost where these do not reach;
 - `compact=True` gives tiles instead of images, to be compared with targets that `to_tiles` cut up beforehand.
 
-Opacity is of all that is rendered. To see how much of it is the liquid's where it stands before and behind a frozen
-background, give the liquid a further channel of ones and the background one of zeros: that channel is the liquid's
-visible opacity.
+Opacity is of all that is rendered. For the liquid's visible opacity, before and behind a frozen background, give the
+liquid a further channel of ones and the background one of zeros. That channel then holds it.
 """
 
 from __future__ import annotations

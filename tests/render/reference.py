@@ -191,10 +191,13 @@ def threshold_pixels(
 ) -> torch.Tensor:
     """bool [H, W]: where rounding may decide what is drawn, so that float32 and float64 may rightly differ.
 
-    True where, among the Gaussians that light reaches, one has an alpha within `tolerance` (relative) of MIN_ALPHA or
-    MAX_ALPHA, leaves a transmittance within `tolerance` of MIN_TRANSMITTANCE, is seen there and lies within `tolerance`
-    of the near plane or of where the Jacobian is clamped, or is within `depth_tolerance` (relative) of the depth of its
-    neighbor in the order. Equal depths are no doubt: the order of the input decides. Arguments as in `rasterize`.
+    True where one of the Gaussians that light reaches is near a threshold, relative to its value:
+    - its alpha within `tolerance` of MIN_ALPHA or MAX_ALPHA;
+    - the transmittance that it leaves within `tolerance` of MIN_TRANSMITTANCE;
+    - its place, if it is seen there, within `tolerance` of the near plane or of where the Jacobian is clamped;
+    - its depth within `depth_tolerance` of its neighbor's in the order. Equal depths are no doubt: the order of the
+      input decides.
+    Arguments as in `rasterize`.
     """
     splats = project(means.double(), factors.double(), opacities.double(), camera, tolerance)
 
