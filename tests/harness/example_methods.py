@@ -95,6 +95,13 @@ class OutOfMemory(Good):
         raise MemoryError("cannot allocate 10 TiB")
 
 
+class OutOfDeviceMemory(Good):
+    """Fails as PyTorch does where a GPU has no memory left."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        raise RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+
 class NotFinite(Good):
     """One NaN pixel in one frame."""
 

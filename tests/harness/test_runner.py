@@ -65,6 +65,7 @@ def test_a_folder_without_scene_json_may_have_any_name(balls_copy: Path, tmp_pat
         ("Die", Status.CRASHED, "exit code 7"),
         ("Killed", Status.OUT_OF_MEMORY, "signal 9"),
         ("OutOfMemory", Status.OUT_OF_MEMORY, "10 TiB"),
+        ("OutOfDeviceMemory", Status.OUT_OF_MEMORY, "RuntimeError: CUDA out of memory"),
         ("NotFinite", Status.NOT_FINITE, "camera 6, timestep 3: the render has NaN"),
         ("WrongSize", Status.WRONG_SIZE, r"rgb is \(32, 48, 3\)"),
         ("Integers", Status.OUT_OF_RANGE, r"rgb is float32 from 0 to 63.75, not floats in \[0, 1\]"),
