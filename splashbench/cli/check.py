@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from splashbench.cli.command import add_command
-from splashbench.cli.output import emit, say
+from splashbench.cli.output import report_faults, say
 
 _EPILOG = """\
 example:
@@ -41,10 +41,4 @@ def run(arguments: argparse.Namespace) -> int:
         record = Submission.open(arguments.submission, verify=False).record
         if record.status != Status.OK:
             say(f"{arguments.submission}: the run ended with status {record.status.value}: {one_line(record.reason)}")
-    if arguments.json:
-        emit({"submission": str(arguments.submission), "ok": not faults, "faults": faults})
-    for fault in faults:
-        say(f"error: {fault}")
-    if not faults:
-        say(f"{arguments.submission}: no fault found")
-    return 1 if faults else 0
+    return report_faults("submission", arguments.submission, faults, arguments.json)

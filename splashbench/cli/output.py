@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 
@@ -22,6 +24,17 @@ def say(text: str = "") -> None:
 def emit(data: dict[str, Any]) -> None:
     """Print the one JSON object of a command run with `--json`. NaN and infinity raise ValueError: JSON has neither."""
     print(json.dumps(data, indent=1, allow_nan=False))
+
+
+def report_faults(noun: str, place: Path, faults: Sequence[str], as_json: bool) -> int:
+    """Print every fault of the `noun` (scene, submission) at `place` on a line of its own; returns the exit status."""
+    if as_json:
+        emit({noun: str(place), "ok": not faults, "faults": list(faults)})
+    for fault in faults:
+        say(f"error: {fault}")
+    if not faults:
+        say(f"{place}: no fault found")
+    return 1 if faults else 0
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

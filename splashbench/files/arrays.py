@@ -27,8 +27,9 @@ def read_npz(
 ) -> dict[str, Any]:
     """Read named arrays with the number of dimensions given, without pickles and within limits.
 
-    Returns the arrays of `names`, and those of `optional` that are there. Raises SplashbenchError when the file is
-    missing, holds too much, or an array is absent, of another rank, not numeric, or not finite.
+    `names` and `optional` map an array's name to its number of dimensions. Returns the arrays of `names`, and those of
+    `optional` that exist. Raises SplashbenchError where the file is missing or too large, or where an array is absent,
+    of another rank, not numeric or not finite.
     """
     path = Path(path)
     limit = MAX_NPZ_BYTES if max_bytes is None else max_bytes

@@ -21,20 +21,20 @@ def _sibling(path: Path) -> Path:
 
 
 def is_staged_for(path: Path, output: Path) -> bool:
-    """Whether `path` has the place and name of a staging folder for `output`: what a killed process may leave."""
+    """Whether `path` is named like a staging folder for `output`, such as a killed process may leave."""
     output = Path(output).resolve()
     staged = _STAGED.match(path.name)
     return path.parent == output.parent and staged is not None and path.name[staged.end() :] == output.name
 
 
 def as_asked(path: Path | str) -> str:
-    """`path` under the name the user knows, not that of its staging place."""
+    """`path` under the name that the user gave, not that of its staging place."""
     return _STAGED.sub("", str(path))
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `path`; rename it onto `path` on success, remove it on any failure."""
+    """Yield a temporary sibling of `path`. Success renames it onto `path`; failure removes it."""
     path = Path(path)
     require_file_place(path)
     made_parent = not path.parent.exists()
@@ -56,13 +56,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def raise_if_disk_full(path: Path | str, error: Exception) -> None:
-    """Turn "the disk took no more" into the one line a user needs; libraries report it in several ways."""
+    """Raise DiskFullError where `error` says that the disk is full; libraries report it in several ways."""
     if isinstance(error, DiskFullError):
         raise error
     if not isinstance(error, OSError):
         return
     no_room = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    # Pillow's encoders and numpy's tofile report a failed write by words of their own and lose the system's number.
+    # Pillow's encoders and numpy's tofile drop the system's error number; only their messages tell of a failed write.
     text = str(error)
     library_failed = error.errno is None and (
         "when writing image file" in text or ("requested and" in text and "written" in text)
@@ -77,16 +77,16 @@ def raise_if_disk_full(path: Path | str, error: Exception) -> None:
 def atomic_directory(
     path: Path, replace: bool = False, *, holds: str | None = None, inputs: Sequence[Path] = ()
 ) -> Iterator[Path]:
-    """Yield a temporary sibling directory that becomes `path` on success and disappears on any failure.
+    """Yield a temporary sibling directory. Success renames it to `path`; failure removes it.
 
     Args:
         replace: whether what is at `path` may go; an empty directory counts as absent.
-        holds: a file by which earlier outputs are told: a directory without it is never replaced.
+        holds: a file that every output of this kind has; a directory without it is never replaced.
         inputs: what the output is made from; a place that holds one of them is never replaced.
 
     Raises SplashbenchError where there is something at `path` that may not be replaced.
     """
-    path = Path(path).resolve()  # a link stays and its target is replaced
+    path = Path(path).resolve()  # a link stays; its target is replaced
     _require_replaceable(path, replace, holds, inputs)
     require_folder_place(path.parent if path.exists() else path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ def atomic_directory(
     try:
         temporary.mkdir()
         yield temporary
-        # Again, as another process may have made its own meanwhile.
+        # Checked again: another process may have written `path` meanwhile.
         _require_replaceable(path, replace, holds, inputs)
         if path.exists():
             path.rename(retired)
@@ -104,7 +104,7 @@ def atomic_directory(
         raise_if_disk_full(path, error)
         raise
     finally:
-        # A failed rename must not cost the user what was there before.
+        # A failed rename must not lose what was at `path` before.
         if retired.exists() and not path.exists():
             retired.rename(path)
         for leftover in (temporary, retired):
@@ -128,7 +128,7 @@ def _require_replaceable(path: Path, replace: bool, holds: str | None, inputs: S
 
 @contextmanager
 def files_together(directory: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `directory`; on success its files move into `directory`, on failure none does.
+    """Yield a temporary sibling of `directory`. Success moves its files into `directory`; failure moves none.
 
     Unlike `atomic_directory` it leaves other files in `directory` where they are.
     """

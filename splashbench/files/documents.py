@@ -43,7 +43,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def validate_model(path: Path, model: type[Model], data: Any) -> Model:
-    """Validate `data`, read from `path`, against a pydantic model; the first fault becomes the one-line error."""
+    """Validate `data`, read from `path`, against a pydantic model. Raises SplashbenchError with the first fault."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -9,14 +9,14 @@ from splashbench.errors import SplashbenchError
 
 
 def require_file_place(path: Path) -> None:
-    """Raise SplashbenchError where a file cannot take the place `path`: before long work."""
+    """Raise SplashbenchError where no file can be written at `path`; called before long work."""
     if Path(path).is_dir():
         raise SplashbenchError(f"{path} is a folder; give the name of a file")
     require_folder_place(Path(path).parent)
 
 
 def require_folder_place(directory: Path) -> None:
-    """Raise SplashbenchError where `directory` is or lies below a file, or may not be written: before long work."""
+    """Raise SplashbenchError where `directory` is a file, lies below one, or may not be written."""
     place = Path(directory).resolve()
     while not place.exists():
         place = place.parent
@@ -27,9 +27,9 @@ def require_folder_place(directory: Path) -> None:
 
 
 def require_plain_file(path: Path) -> None:
-    """Raise SplashbenchError for a folder, a pipe or a device: reading it would fail oddly, or wait for ever.
+    """Raise SplashbenchError for a folder, a pipe or a device, whose reading would fail oddly or never end.
 
-    A file that does not exist is left to the reader.
+    A missing file passes: its reader reports it.
     """
     if path.exists() and not path.is_file():
         raise SplashbenchError(

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splashbench.cli.main import main
+
 Fails = Callable[..., str]
 
 
@@ -76,3 +78,20 @@ def test_a_truth_of_the_wrong_shape_is_named(session: Path, balls_directory: Pat
     for text in ("", "[]", "{}", '{"schema_version": 1}', "\0"):
         (session / "truth" / "truth.json").write_text(text)
         assert "truth.json" in fails("synth", "verify", session, balls_directory)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--square-metres", "0.03", "SCENE"], "--square-metres goes with --init"),
+        (["SCENE", "--init"], "--init writes session.toml and makes no scene; leave SCENE out"),
+        ([], "the following arguments are required: SCENE"),
+    ],
+)
+def test_options_of_prepare_that_do_not_go_together_are_wrong_usage(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["prepare", "SESSION", *words])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err

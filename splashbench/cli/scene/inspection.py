@@ -7,7 +7,7 @@ import json
 
 from splashbench.cli.arguments import add_scene
 from splashbench.cli.command import add_command
-from splashbench.cli.output import emit, say
+from splashbench.cli.output import emit, report_faults
 
 _CHECK_EPILOG = """\
 example:
@@ -51,14 +51,7 @@ def check(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene check`."""
     from splashbench.scene.inspection import check_scene
 
-    faults = check_scene(arguments.scene)
-    if arguments.json:
-        emit({"scene": str(arguments.scene), "ok": not faults, "faults": faults})
-    for fault in faults:
-        say(f"error: {fault}")
-    if not faults:
-        say(f"{arguments.scene}: no fault found")
-    return 1 if faults else 0
+    return report_faults("scene", arguments.scene, check_scene(arguments.scene), arguments.json)
 
 
 def info(arguments: argparse.Namespace) -> int:
