@@ -179,6 +179,14 @@ def test_neither_gravity_nor_the_upper_side_need_be_known() -> None:
     assert degrees < 0.3
 
 
+def test_a_closed_box_may_stand_on_its_head_and_that_is_reported() -> None:
+    box = trimesh.creation.box((0.3, 0.12, 0.16))
+    mesh, cameras = ContainerMesh(box.vertices, box.faces), rig(200, 300, 400.0)[:3]
+    found = place_by_silhouettes(mesh, cameras, exact_masks(mesh, pose(20), cameras))
+    assert found.up_is_ambiguous
+    assert found.up_axis == "y"
+
+
 def test_a_wrong_mesh_shows_in_the_figures() -> None:
     cameras = rig()
     masks = exact_masks(tank(), pose(33), cameras)

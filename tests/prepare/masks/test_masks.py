@@ -65,6 +65,18 @@ def test_an_empty_frame_has_an_empty_mask() -> None:
         assert not segment(*background.compare(recorded(empty, rng))).any()
 
 
+@pytest.mark.parametrize("gain", [(1.3, 1.3, 1.3), (0.85, 1.0, 1.15)], ids=["brighter", "another white balance"])
+def test_a_change_of_the_whole_picture_is_no_liquid(gain: tuple[float, float, float]) -> None:
+    """Beyond what a shadow or a reflection explains: the camera has set its exposure or white balance anew."""
+    rng = np.random.default_rng(5)
+    empty = scenery(rng)
+    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
+    coverage = blob(25, 90, 90)
+    frame = (empty * (1 - coverage[..., None]) + np.array([60, 90, 190]) * coverage[..., None]) * gain
+    assert intersection_over_union(segment(*background.compare(recorded(frame, rng))), coverage > 0.5) > 0.95
+    assert not segment(*background.compare(recorded(empty * gain, rng))).any()
+
+
 def test_a_thin_stream_keeps_its_width() -> None:
     rng = np.random.default_rng(3)
     empty = scenery(rng)

@@ -17,7 +17,7 @@ from splashbench.prepare.calibration.board import BoardDetector, BoardView
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.poses import mapping, rig
 from splashbench.prepare.poses import structure_from_motion as poses_module
-from splashbench.prepare.poses.metric import Sighting, align, initial_points, transformed
+from splashbench.prepare.poses.metric import Print, Sighting, align, align_print, initial_points, transformed
 from splashbench.prepare.poses.rig import find_poses, sight_prints
 from splashbench.prepare.poses.structure_from_motion import Poses, estimate_poses
 from splashbench.prepare.session_tables import Board
@@ -345,6 +345,9 @@ def test_a_board_lying_face_down_is_refused(capture: Capture, solved: Poses) -> 
     ]
     with pytest.raises(SplashbenchError, match="below the board"):
         align(mirrored, BoardDetector(BOARD))
+    # Where only its size is of interest, it may face anywhere.
+    size = align_print(mirrored, Print.of_board(BoardDetector(BOARD)), upright=False)
+    assert size.scene_from_sfm.scale == pytest.approx(align(sightings, BoardDetector(BOARD)).scene_from_sfm.scale)
 
 
 def _mirrored_order() -> np.ndarray:

@@ -256,7 +256,7 @@ def test_the_scale_sigma_of_a_print_is_the_scatter_of_its_scale() -> None:
         scales.append(frame.scene_from_sfm.scale * SFM.scale)
         sigmas.append(frame.scale_sigma)
     assert np.mean(scales) == pytest.approx(1, abs=2e-4)
-    assert np.std(scales) == pytest.approx(np.mean(sigmas), rel=0.5)
+    assert np.std(scales) == pytest.approx(np.mean(sigmas), rel=0.25)
 
 
 def test_a_frame_needs_a_direction() -> None:
