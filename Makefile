@@ -13,21 +13,24 @@ SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all lint wheel kernel sanitize clean
+.PHONY: help demo quick-test test test-all lint docs pictures wheel kernel sanitize clean
 
 # The compiled kernels, and what builds them: where one of these changes, they are built and installed anew.
 KERNEL_FOLDERS := splashbench/native splashbench/*/kernel methods/*/kernel
 KERNEL := setup.py build_kernel.py build_compilers.py $(wildcard $(foreach folder,$(KERNEL_FOLDERS),$(folder)/*.cpp $(folder)/*.h))
 
 help:
-	@echo "make demo      film a synthetic pour, reconstruct it and score it, into demo_output/"
-	@echo "make test      run the tests, the slow ones left out"
-	@echo "make test-all  run every test (those without a CUDA device to run on skip)"
-	@echo "make lint      check style and types"
-	@echo "make wheel     build the wheel into dist/"
-	@echo "make kernel    build the compiled kernels in place, after an edit"
-	@echo "make sanitize  run the kernels' tests under AddressSanitizer and UndefinedBehaviorSanitizer (needs g++)"
-	@echo "make clean     remove everything the targets above made, .venv included"
+	@echo "make demo        film a synthetic pour, reconstruct it and score it, into demo_output/"
+	@echo "make quick-test  run some tests of every part, in under two minutes: after each edit"
+	@echo "make test        run the tests, the slow ones left out: before each commit"
+	@echo "make test-all    run every test (those without a CUDA device to run on skip)"
+	@echo "make lint        check style, types, and which part imports which"
+	@echo "make docs        build the documentation site into site/; open site/index.html"
+	@echo "make pictures    draw the pictures of README.md and of the site anew (an hour: it fits two methods)"
+	@echo "make wheel       build the wheel into dist/"
+	@echo "make kernel      build the compiled kernels in place, after an edit"
+	@echo "make sanitize    run the kernels' tests under AddressSanitizer and UndefinedBehaviorSanitizer (needs g++)"
+	@echo "make clean       remove everything the targets above made, .venv included"
 
 demo: .venv/installed-synth
 	@echo "==> Running the demo"
@@ -38,6 +41,19 @@ test: .venv/installed-test
 	@echo "==> Running the tests"
 	$(PYTEST) -m "not slow and not cuda" -n auto --maxprocesses=4 --dist=loadfile
 
+# Something of every folder of tests/, chosen by how long it takes; tests/test_quick.py holds it against the folders.
+QUICK := $(addprefix tests/test_, alignment.py architecture.py files.py manifest.py markdown.py public_names.py quick.py) \
+  $(addprefix tests/, cli/test_arguments.py cli/test_help.py container/test_container_released.py \
+  docs/test_commands.py docs/test_links.py docs/test_python_blocks.py gaussians/test_ssim.py \
+  harness/test_output_checks.py harness/test_training_copy.py methods/test_renamed_settings.py \
+  methods/test_scaffold_parts.py native/test_native_library.py observe/test_observe_fields.py prepare/test_gates.py \
+  prepare/test_session.py render/test_render_parts.py report/test_report_leaderboard.py scene/test_camera.py \
+  score/test_score_neighbours.py score/test_score_notation.py study/test_study_table.py \
+  submission/test_submission.py synth/test_synth_audio.py)
+quick-test: .venv/installed-test
+	@echo "==> Running the quick tests"
+	$(BIN)/python -m pytest -q -m "not slow and not cuda" -n auto --maxprocesses=2 --dist=loadfile $(QUICK)
+
 test-all: .venv/installed-test
 	@echo "==> Running every test"
 	$(PYTEST)
@@ -47,6 +63,17 @@ lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+# Strict: a broken link or reference ends the build. mkdocs-material's notice about its successor is left out.
+docs: .venv/installed-docs
+	@echo "==> Building the documentation site"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "open site/index.html"
+
+pictures: .venv/installed-synth
+	@echo "==> Drawing the pictures; scenes and fits go into build/pictures"
+	$(BIN)/python docs/tools/pictures.py
 
 wheel: .venv/ready
 	@echo "==> Building the wheel"
@@ -68,7 +95,7 @@ sanitize: .venv/installed-test
 	$(BIN)/python -m pytest -q -m "not slow and not cuda" tests/native tests/render tests/methods/splashsplat/test_kernel_*.py
 
 clean:
-	rm -rf .venv build dist demo_output *.egg-info .pytest_cache .mypy_cache .ruff_cache splashbench/*/kernel/lib*.so methods/*/kernel/lib*.so
+	rm -rf .venv build dist site demo_output example_output *.egg-info .pytest_cache .mypy_cache .ruff_cache splashbench/*/kernel/lib*.so methods/*/kernel/lib*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One call of pip for each set of optional packages, repeated only when what it would install may have changed.
