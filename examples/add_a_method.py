@@ -47,8 +47,10 @@ def main(out: Path) -> Result:
         write_balls_scene(out / "balls", size=(192, 128))
     method = f"{Path(__file__).resolve()}:NearestView"
     submission = run_method(method, out / "balls", out / "nearest_view", timing_frames=0, replace=True)
+    if submission.status != "ok":
+        raise SystemExit(f"{submission.status.value}: {submission.reason}")
     result = score_submission(Scene.open(out / "balls"), submission)
-    print(f"{result.status} {result.reason}: PSNR {result.value('psnr'):.1f} dB, mIoU {result.value('miou'):.3f}")
+    print(f"PSNR {result.value('psnr'):.1f} dB, mIoU {result.value('miou'):.3f}")
     return result
 
 
