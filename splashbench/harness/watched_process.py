@@ -76,7 +76,7 @@ def watch(
         )
     start, peak, timed_out = time.monotonic(), 0, False
     bar = Bar(label, keep_bar)
-    reader = _ProgressReader(progress)
+    reader = ProgressReader(progress)
     last_update, fraction = start, 0.0
     try:
         while process.poll() is None:
@@ -138,7 +138,7 @@ def _kill_marked(mark: str, group: int) -> list[str]:
     return strays
 
 
-class _ProgressReader:
+class ProgressReader:
     """Whole new lines of the progress file since the last look."""
 
     def __init__(self, path: Path) -> None:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
 from splashbench.harness.oracle import write_oracle
-from splashbench.scene import Scene
+from splashbench.scene import Particles, Scene
 from splashbench.submission import Identity, Record, Submission, check_submission, to_8bit
 
 
@@ -66,6 +66,14 @@ def test_check_lists_every_fault(copy: Path, balls: Scene) -> None:
     assert "renders/6/000001.png does not match its digest" in faults
     assert "renders/6/000001.png is 10x10, not 96x64" in faults
     assert "alpha/7/000002.png is missing" in faults
+
+
+def test_check_counts_the_timesteps_of_arrays(copy: Path, balls: Scene) -> None:
+    n = balls.n_frames
+    Particles(np.zeros((n - 1, 1, 3)), np.ones((n - 1, 1), bool)).save(copy / "particles.npz")
+    assert f"{copy / 'particles.npz'} has {n - 1} instants, the scene {n}" in check_submission(copy, balls)
+    Particles(np.zeros((n, 1, 3)), np.ones((n, 1), bool)).save(copy / "particles.npz")
+    assert not any("instants" in fault for fault in check_submission(copy, balls))
 
 
 def test_check_sees_another_scene(copy: Path, balls_copy: Path) -> None:
