@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from splashbench.harness.contract import MethodConfig
-from splashbench.observe.signed_distance import DistanceMethod
+from splashbench.observe.signed_distance import SignedDistanceMethod
 
 from .appearance.decoder import DecoderSettings
 from .appearance.fitting import FitSettings
@@ -39,7 +39,7 @@ class SplashSplatConfig(MethodConfig):
     transport_cells: int = Field(112, ge=16, le=256)
     control_cells: int = Field(28, ge=4, le=128)
     #: how phi_t is computed: straight from the "silhouette", or by "carve" as in the paper
-    signed_distance: DistanceMethod = "silhouette"
+    signed_distance: SignedDistanceMethod = "silhouette"
     #: use the container's mesh, where the scene has one: what it hides, and where its walls are
     container: bool = True
     #: leave out masks that miss much of the liquid, as well as empty ones

@@ -19,7 +19,7 @@ from splashbench.observe.kernels import sample
 from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion
 from splashbench.observe.silhouettes import MaskedScene, Silhouettes
 
-DistanceMethod = Literal["silhouette", "carve"]
+SignedDistanceMethod = Literal["silhouette", "carve"]
 PADDING = 0.1
 
 
@@ -75,7 +75,7 @@ def signed_distance_of(occupied: np.ndarray) -> np.ndarray:
 def signed_distance_frames(
     silhouettes: Silhouettes,
     grid: Grid,
-    method: DistanceMethod = "silhouette",
+    method: SignedDistanceMethod = "silhouette",
     container: ContainerOcclusion | None = None,
 ) -> Iterator[np.ndarray]:
     """phi of one frame after another on `grid`, float32 [nx, ny, nz] in voxels: no more than one frame in memory.
@@ -92,7 +92,7 @@ def signed_distance_fields(
     scene: MaskedScene,
     cells_longest_axis: int = 96,
     views: Sequence[str] | None = None,
-    method: DistanceMethod = "silhouette",
+    method: SignedDistanceMethod = "silhouette",
     container: ContainerOcclusion | None = None,
     detect_failed_masks: bool = False,
 ) -> SignedDistanceFields:

@@ -15,7 +15,7 @@ from splashbench.observe.signed_distance import signed_distance_frames
 from splashbench.observe.silhouettes import Silhouettes
 
 from .jet import STANDARD_GRAVITY, Jet, Slices, fit_jets, framed, open_floor, slices_of
-from .pool import Pool
+from .pool import LiquidPool
 from .vessel import Vessel, upright
 
 _CELLS = 96
@@ -35,7 +35,7 @@ class GravityCues:
     turn: np.ndarray
     jets: list[Jet | None]
     floor: float
-    pool: Pool | None
+    pool: LiquidPool | None
     levels: np.ndarray
     container_depths: list[np.ndarray | None]
 
@@ -92,7 +92,11 @@ def gravity_cues(
     """
     turn = upright(gravity)
     vessel = None if container is None else Vessel.of(container.mesh, gravity)
-    pool = None if vessel is None or container is None or not find_pool else Pool(vessel, silhouettes, container.hides)
+    pool = (
+        None
+        if vessel is None or container is None or not find_pool
+        else LiquidPool(vessel, silhouettes, container.hides)
+    )
     levels = np.full(silhouettes.n_frames, np.nan) if pool is None else pool.levels()
     jets: list[Jet | None] = [None] * silhouettes.n_frames
     floor = -np.inf

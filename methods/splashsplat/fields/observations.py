@@ -21,7 +21,7 @@ from splashbench.observe.grid import Bounds
 from splashbench.observe.kernels import resample
 from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.observe.reduced_masks import reduced
-from splashbench.observe.signed_distance import PADDING, DistanceMethod
+from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.scene import TrainingScene
 
@@ -40,7 +40,7 @@ class FieldSettings:
 
     hull_cells: int
     transport_cells: int
-    signed_distance: DistanceMethod
+    signed_distance: SignedDistanceMethod
     container: bool
     detect_failed_masks: bool
     camera_times: bool

@@ -49,7 +49,7 @@ class PoolView:
     heights: np.ndarray
 
 
-class Pool:
+class LiquidPool:
     """Finds the level of the pool in each frame, and lowers the hull to it."""
 
     def __init__(self, vessel: Vessel, silhouettes: Silhouettes, opaque: bool) -> None:

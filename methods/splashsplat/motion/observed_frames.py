@@ -14,8 +14,8 @@ import numpy as np
 from splashbench.harness.contract import Run
 from splashbench.scene.scene import TrainingScene
 
-from ..fields.distance_file import DistanceFile, shared_distances
 from ..fields.observations import Observations, Report, pack_signed_distance
+from ..fields.signed_distance_file import SignedDistanceFile, shared_signed_distances
 from .fall import JetFall
 from .gate import gated
 from .steps import FrameStep
@@ -57,7 +57,7 @@ def observed_frames(
         what = "signed distance, velocity, carriers" if settings.moves else "carriers"
         yield from _frames(observations, observations.signed_distances(run), fit.control, fit, 0.0, what, report)
         return
-    with shared_distances(
+    with shared_signed_distances(
         observations, scene, run, lambda done, what: report(_DISTANCES_DONE * done, what)
     ) as distances:
         controls = _shared_controls(distances, observations, scene, fit, report) if settings.moves else None
@@ -123,7 +123,7 @@ class _MotionFit:
 
 
 def _shared_controls(
-    distances: DistanceFile, observations: Observations, scene: TrainingScene, fit: _MotionFit, report: Report
+    distances: SignedDistanceFile, observations: Observations, scene: TrainingScene, fit: _MotionFit, report: Report
 ) -> np.ndarray:
     """u of all steps, float32 [T - 1, cx, cy, cz, 3] voxels per frame."""
     settings = fit.settings

@@ -15,7 +15,7 @@ from splashbench.scene.container import ContainerMesh
 from splashbench_methods.splashsplat.carriers.visibility import seen_by_any
 from splashbench_methods.splashsplat.fields.gravity_cues import gravity_cues
 from splashbench_methods.splashsplat.fields.jet import Jet, Slices, fit_jets, framed, open_floor, slices_of
-from splashbench_methods.splashsplat.fields.pool import Pool
+from splashbench_methods.splashsplat.fields.pool import LiquidPool
 from splashbench_methods.splashsplat.fields.vessel import Vessel, upright
 from splashbench_methods.splashsplat.motion.fall import JetFall, falls_of, table_of
 from splashbench_methods.splashsplat.motion.gate import gated
@@ -282,7 +282,7 @@ def test_the_level_is_where_the_masks_end_on_the_wall(opaque):
     scene = PouredBox(0.05, opaque)
     vessel = Vessel.of(scene.mesh, DOWN)
     assert vessel.rim == pytest.approx(0.12, abs=0.01)
-    levels = Pool(vessel, Silhouettes(scene), opaque).levels()
+    levels = LiquidPool(vessel, Silhouettes(scene), opaque).levels()
     np.testing.assert_allclose(levels, 0.05, atol=0.005)
 
 
@@ -308,7 +308,7 @@ def test_the_dome_over_a_pool_goes_and_the_pool_is_full(poured):
     grid = Grid.over(sequence_bounds(silhouettes, container).padded(0.1), 56)
     phi = carve_frame(silhouettes, grid, 0)
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    settled = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi, grid, 0.06, depths)
+    settled = LiquidPool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi, grid, 0.06, depths)
     points = grid.nodes()
     truth = (np.abs(points[..., 0]) < 0.1) & (np.abs(points[..., 2]) < 0.08) & (points[..., 1] > 0)
     truth &= points[..., 1] < 0.06
@@ -328,7 +328,7 @@ def test_what_falls_into_the_pool_is_kept(poured):
     grid = Grid.over(Bounds(np.array([-0.12, -0.02, -0.1]), np.array([0.12, 0.2, 0.1])), 48)
     jet = Jet(0.2, np.zeros(2), np.zeros(2), 1.0, G, 0.02)
     phi = np.full(grid.shape, -5, np.float32)
-    pool = Pool(Vessel.of(poured.mesh, DOWN), silhouettes, True)
+    pool = LiquidPool(Vessel.of(poured.mesh, DOWN), silhouettes, True)
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
     low, kept = pool.lowered(phi, grid, 0.06, depths), pool.lowered(phi, grid, 0.06, depths, jet)
     node = tuple(np.round(grid.to_voxels(np.array([0.0, 0.09, 0.0]))).astype(int))

@@ -21,7 +21,7 @@ _COPIED_AT_ONCE = 1 << 22
 
 
 @dataclass(frozen=True)
-class DistanceFile:
+class SignedDistanceFile:
     """Frames of float16 in `stream`, one after another; each of `shape`. Iterating starts at the first."""
 
     stream: IO[bytes]
@@ -33,14 +33,16 @@ class DistanceFile:
         for _ in range(self.n_frames):
             yield np.frombuffer(self.stream.read(2 * int(np.prod(self.shape))), np.float16).reshape(self.shape)
 
-    def __enter__(self) -> DistanceFile:
+    def __enter__(self) -> SignedDistanceFile:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stream.close()
 
 
-def shared_distances(observations: Observations, scene: TrainingScene, run: Run, report: Report) -> DistanceFile:
+def shared_signed_distances(
+    observations: Observations, scene: TrainingScene, run: Run, report: Report
+) -> SignedDistanceFile:
     """`Observations.signed_distances` in a file of the study's cache, computed now or by an earlier run."""
     stored: list[IO[bytes]] = []
 
@@ -67,4 +69,4 @@ def shared_distances(observations: Observations, scene: TrainingScene, run: Run,
         return (directory / _FILE).open("rb")
 
     stream = run.reuse("distances", scene, observations.settings.key(), write, save, load, seeded=False)
-    return DistanceFile(stored[0] if stored else stream, observations.hull_grid.shape, observations.n_frames)
+    return SignedDistanceFile(stored[0] if stored else stream, observations.hull_grid.shape, observations.n_frames)
