@@ -12,11 +12,12 @@ from splashbench_methods.splashsplat.carriers.resampling import (
     ShellSettings,
     cell_of,
     newborns,
+    target_population,
     within_capacity,
 )
 from splashbench_methods.splashsplat.carriers.tracking import CarrierSettings, CarrierTracker, Tracking
 from splashbench_methods.splashsplat.motion.advection import clamp_stretch, forecast
-from splashbench_methods.splashsplat.motion.steps import Motion
+from splashbench_methods.splashsplat.motion.steps import FrameStep, Motion
 from splashbench_methods.splashsplat.motion.velocity import (
     DivergenceFree,
     VelocityFit,
@@ -221,6 +222,64 @@ def test_a_drop_too_small_for_the_grid_gets_carriers_beyond_its_surface():
     for outside, some in ((0.0, False), (0.5, True)):
         born = newborns(drop, GRID, 1.0, empty, ShellSettings(outside=outside), np.random.default_rng(0))
         assert (len(born) > 0) == some
+
+
+def test_cells_near_the_surface_and_curved_ones_want_more_carriers():
+    shell = ShellSettings(min_per_cell=2, max_per_cell=10, curvature_weight=0.1)
+    across = np.broadcast_to(np.arange(SIZE, dtype=np.float32)[:, None, None] - 20, (SIZE,) * 3)
+    flat, curved = np.ascontiguousarray(across), 0.5 * across**2 - 1
+    at = np.array([[20, 20, 20], [19, 20, 20]], dtype=np.float32)
+    # 2 + 8 (exp(-|phi|) / 2 + 0.1 |Laplacian|): the plane has no Laplacian, the parabola has 1 at phi = -1.
+    np.testing.assert_array_equal(target_population(flat, at, 1.0, shell), [6, 3])
+    np.testing.assert_array_equal(target_population(curved, at[:1], 1.0, shell), [4])
+
+
+def test_no_carrier_is_born_where_no_view_sees_and_fliers_rest_where_they_land():
+    fields = [ball((20, 20, 20)), ball((20, 20, 20))]
+    settings = CarrierSettings(shell=SHELL)
+
+    def seen(phi: np.ndarray, points: np.ndarray) -> np.ndarray:
+        return points[:, 0] > 20
+
+    def landed(t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        assert t == 1
+        return start + np.float32([0, 0.25, 0])
+
+    tracker = CarrierTracker(Tracking(GRID, GRID, settings, seed=3, seen=seen, landed=landed))
+    still = FrameStep(np.zeros((*control_shape((SIZE,) * 3, FACTOR), 3), np.float32), FACTOR)
+    tracker.advance(fields[0], None)
+    tracker.advance(fields[1], still)
+    carriers = tracker.carriers()
+    first, second = (carriers.positions[carriers.rows(t)] for t in range(2))
+    assert carriers.positions[:, 0].min() > 20
+    ids = carriers.ids[carriers.rows(1)]
+    low = first[:, 1] < 19  # these stay within the ball, where nothing is corrected
+    lasting = np.intersect1d(ids, np.flatnonzero(low))
+    assert len(lasting) > 100
+    moved = second[np.searchsorted(ids, lasting)] - first[lasting]
+    assert np.median(np.abs(moved - [0, 0.25, 0])) < 1e-5
+
+
+def test_carriers_that_sank_below_the_shell_go():
+    fields = [ball((20, 20, 20)), ball((20, 20, 20), radius=13.0)]  # the surface leaves them 5 voxels below
+    for kill_inside, some in ((-3.0, False), (None, True)):
+        births, ends = track(fields, kill_inside=kill_inside).births_and_ends()
+        assert (ends[births == 0] == 1).any() == some
+
+
+@pytest.mark.parametrize(("capacity", "lasting"), [(4, 4), (7, 7), (None, 400)])
+def test_a_crowded_cell_keeps_as_many_as_it_may(capacity: int | None, lasting: int):
+    def landed(t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        return np.full_like(end, 20.5) - np.float32([0, 0, 8])  # all in one cell below the surface
+
+    settings = CarrierSettings(shell=SHELL, cell_capacity=capacity)
+    tracker = CarrierTracker(Tracking(GRID, GRID, settings, seed=3, landed=landed))
+    tracker.advance(ball((20, 20, 20)), None)
+    tracker.advance(ball((20, 20, 20)), FrameStep(np.zeros((10, 10, 10, 3), np.float32), FACTOR))
+    births, ends = tracker.carriers().births_and_ends()
+    old = np.flatnonzero((births == 0) & (ends == 1))
+    assert len(old) == lasting if capacity else len(old) > lasting
+    assert old.tolist() == list(range(len(old)))  # the oldest, which have the smallest numbers
 
 
 def test_crowded_cells_keep_their_oldest():
