@@ -35,7 +35,7 @@ POUR_2 = '2 = [\n    "2.MP4",\n]'
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda s: silent_clip(s / "2.MP4"), "2.MP4 has no audio track"),
         (lambda s: (s / "2.MP4").write_bytes((s / "2.MP4").read_bytes()[:9000]), "2.MP4 is damaged, cut short"),
@@ -57,11 +57,11 @@ POUR_2 = '2 = [\n    "2.MP4",\n]'
     ],
 )
 def test_an_unusable_session_is_one_line_and_no_scene(
-    session: Path, tmp_path: Path, fails: Fails, damage: Callable[[Path], object], said: str
+    session: Path, tmp_path: Path, fails: Fails, damage: Callable[[Path], object], message: str
 ) -> None:
     damage(session)
     line = fails("prepare", session, tmp_path / "scenes" / "scene")
-    assert said in line
+    assert message in line
     assert not (tmp_path / "scenes").exists() or list((tmp_path / "scenes").iterdir()) == []
 
 

@@ -10,14 +10,14 @@ import pytest
 from splashbench.cli.main import main
 from splashbench.submission import Submission
 
-METHODS = Path(__file__).parents[1] / "harness" / "example_methods.py"
+METHODS = Path(__file__).parents[2] / "harness" / "example_methods.py"
 GOOD = f"import sys\nsys.path.insert(0, {str(METHODS.parent)!r})\nfrom example_methods import Good\n"
 
 Fails = Callable[..., str]
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         ("def broken(:\n", "SyntaxError"),
         ("\0\0", "cannot be imported"),
@@ -31,11 +31,11 @@ Fails = Callable[..., str]
     ],
 )
 def test_an_unusable_method_is_told_before_anything_runs(
-    balls_directory: Path, tmp_path: Path, fails: Fails, source: str, said: str
+    balls_directory: Path, tmp_path: Path, fails: Fails, source: str, message: str
 ) -> None:
     (tmp_path / "m.py").write_text(source)
     line = fails("run", f"{tmp_path / 'm.py'}:M", balls_directory, tmp_path / "out")
-    assert said in line
+    assert message in line
     assert not (tmp_path / "out").exists()
 
 

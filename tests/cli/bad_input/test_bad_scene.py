@@ -35,7 +35,7 @@ def giant_png(path: Path, side: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "damage", "said"),
+    ("name", "damage", "message"),
     [
         ("train_meta.json", lambda p: p.write_bytes(b""), "cannot be read as JSON"),
         ("train_meta.json", lambda p: p.write_bytes(b'{"w": "\xff"}'), "cannot be read as JSON"),
@@ -61,13 +61,13 @@ def giant_png(path: Path, side: int) -> None:
     ],
 )
 def test_a_damaged_file_of_a_scene_is_named(
-    balls_copy: Path, fails: Fails, name: str, damage: Callable[[Path], object], said: str
+    balls_copy: Path, fails: Fails, name: str, damage: Callable[[Path], object], message: str
 ) -> None:
     damage(balls_copy / name)
     for action in ("info", "check"):
         line = fails("scene", action, balls_copy)
         assert name in line
-        assert said in line
+        assert message in line
 
 
 def test_a_missing_camera_is_named(balls_copy: Path, tmp_path: Path, fails: Fails) -> None:
@@ -77,7 +77,7 @@ def test_a_missing_camera_is_named(balls_copy: Path, tmp_path: Path, fails: Fail
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda p: giant_png(p, 60_000), "not a readable image"),
         (lambda p: giant_png(p, 11_000), "more than 67108864 pixels"),
@@ -90,12 +90,12 @@ def test_a_missing_camera_is_named(balls_copy: Path, tmp_path: Path, fails: Fail
     ids=["bomb", "too large", "postscript", "16 bits", "cut", "pipe", "folder"],
 )
 def test_an_unusable_image_is_named(
-    balls_copy: Path, fails: Fails, damage: Callable[[Path], object], said: str
+    balls_copy: Path, fails: Fails, damage: Callable[[Path], object], message: str
 ) -> None:
     damage(balls_copy / "ims" / "3" / "000002.png")
     line = fails("scene", "check", balls_copy)
     assert "ims/3/000002.png" in line
-    assert said in line
+    assert message in line
 
 
 @pytest.mark.parametrize("offset", [(6, 8, 1, 1), (8, 10, 99, 99)], ids=["encrypted", "unknown compression"])

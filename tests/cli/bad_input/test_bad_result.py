@@ -21,7 +21,7 @@ def edit(path: Path, change: Callable[[dict], object]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda p: p.write_bytes(b""), "cannot be read as JSON"),
         (lambda p: p.write_bytes(b"\xff"), "cannot be read as JSON"),
@@ -33,14 +33,14 @@ def edit(path: Path, change: Callable[[dict], object]) -> None:
     ],
 )
 def test_a_damaged_result_is_named_and_no_leaderboard_is_left(
-    results: Path, tmp_path: Path, fails: Fails, damage: Callable[[Path], object], said: str
+    results: Path, tmp_path: Path, fails: Fails, damage: Callable[[Path], object], message: str
 ) -> None:
     copy = Path(shutil.copytree(results, tmp_path / "results"))
     (path,) = copy.glob("*.json")
     damage(path)
     line = fails("leaderboard", copy, tmp_path / "board")
     assert path.name in line
-    assert said in line
+    assert message in line
     assert not (tmp_path / "board").exists()
 
 

@@ -50,7 +50,7 @@ def test_a_thousand_missing_files_are_one_line_in_score_and_all_in_check(
 
 
 @pytest.mark.parametrize(
-    ("name", "damage", "said"),
+    ("name", "damage", "message"),
     [
         ("submission.toml", lambda p: p.write_bytes(b"\xff\xfe"), "cannot be read as TOML"),
         ("submission.toml", lambda p: p.write_text("a = " + "[" * 100_000), "cannot be read as TOML"),
@@ -61,12 +61,12 @@ def test_a_thousand_missing_files_are_one_line_in_score_and_all_in_check(
     ],
 )
 def test_a_forged_description_is_named(
-    submission: Path, fails: Fails, name: str, damage: Callable[[Path], object], said: str
+    submission: Path, fails: Fails, name: str, damage: Callable[[Path], object], message: str
 ) -> None:
     damage(submission / name)
     line = fails("check", submission)
     assert name in line
-    assert said in line
+    assert message in line
 
 
 def test_particles_beyond_float32_are_refused(
@@ -89,9 +89,9 @@ def test_a_strangers_reason_stays_on_one_line_and_off_the_terminal(
     reseal(submission)
     words = ["score", submission, "--scene", balls_directory, "--out", tmp_path / "results"]
     assert main([str(word) for word in words]) == 0
-    said = capsys.readouterr().err
-    assert "first second ?[31m" in said
-    assert "\x1b" not in said
+    errors = capsys.readouterr().err
+    assert "first second ?[31m" in errors
+    assert "\x1b" not in errors
 
 
 @pytest.mark.parametrize(
