@@ -15,8 +15,9 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import build_kernel
 import pytest
+
+import build_kernel
 from build_compilers import VARIANTS, ZIG, ZIGLANG, Compiler, choose_compiler
 
 ROOT = Path(__file__).parents[2]
@@ -144,6 +145,14 @@ def test_a_wheel_from_the_source_archive(checkout: Path, compilers: Path, tmp_pa
     (path,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         assert [name for name in archive.getnames() if name.endswith(".so") or "/build/" in name] == []
+        # Stand-ins for compilers read nothing, so a header that is missing shows here alone.
+        shipped = {name.partition("/")[2] for name in archive.getnames() if name.endswith((".cpp", ".h"))}
+        assert shipped == {
+            path.relative_to(checkout).as_posix()
+            for folder in ("splashbench", "methods")
+            for path in (checkout / folder).rglob("*")
+            if path.suffix in (".cpp", ".h")
+        }
         if hasattr(tarfile, "data_filter"):
             archive.extractall(tmp_path, filter="data")
         else:
@@ -236,8 +245,10 @@ def test_installs_and_runs_where_there_is_no_compiler(checkout: Path, tmp_path: 
         pytest.skip("pip cannot fetch ziglang here")
     assert outcome.returncode == 0, outcome.stdout + outcome.stderr
     code = (
-        "import importlib.metadata as m, splashbench.render.native as r, splashbench_methods.splashsplat.kernel.library as s;"
-        "print(m.distribution('splashbench').read_text('WHEEL')); print(r.__file__); print(r.KERNEL.variant, s.KERNEL.variant)"
+        "import importlib.metadata as m, splashbench.render.native as r;"
+        "import splashbench_methods.splashsplat.kernel.library as s;"
+        "print(m.distribution('splashbench').read_text('WHEEL')); print(r.__file__);"
+        "print(r.KERNEL.variant, s.KERNEL.variant)"
     )
     outcome = subprocess.run([python, "-c", code], env=environ, cwd=tmp_path, capture_output=True, text=True)
     assert outcome.returncode == 0, outcome.stderr
