@@ -55,7 +55,7 @@ def describe(folder: Path, square_metres: float | None = None, replace: bool = F
     cameras = cameras_of(recording for recording in recordings if recording.subject is not None)
     if len(cameras) < 2:
         raise SplashbenchError(
-            f"{folder}: videos of {len(cameras)} cameras were told apart; put every camera's files into a folder of its"
+            f"{folder}: videos of {len(cameras)} cameras were recognised; put every camera's files into a folder of its"
             " name, or its name before theirs (cam1_GX010001.MP4)"
         )
     board = guess_board(_board_images(folder, recordings))
@@ -154,7 +154,9 @@ def _text(
             blocks.append(toml.dumps({"recordings": {subject: {c: listed[c] for c in cameras if c in listed}}}))
         missing = [camera for camera in cameras if camera not in listed]
         if missing:
-            to_do.append(f"no {subject} recording was told for camera {', '.join(missing)}: add [recordings.{subject}]")
+            to_do.append(
+                f"no {subject} recording was recognised for camera {', '.join(missing)}: add [recordings.{subject}]"
+            )
     sweep = [recording for recording in recordings if recording.subject == "sweep"]
     if sweep:
         blocks.append(toml.dumps({"sweep": {"files": list(sweep[0].files)}}))

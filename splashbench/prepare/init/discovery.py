@@ -1,7 +1,7 @@
 """Which files of a folder belong to one recording, of which camera, and of what: told from their names.
 
 Cameras write GX010003.MP4, GX020003.MP4, ...: chapters 1, 2, ... of recording 3 (GH, GL, GP and GOPR likewise, GoPro's
-"Camera File Chaptering Information"). A camera is told from the folder its files lie in or from what stands before the
+"Camera File Chaptering Information"). A camera is known by the folder its files lie in, or by what stands before the
 camera's own name (cam1_GX010003.MP4); what was filmed, from words such as "pour" or "static" in either. What the names
 leave open stays open here: `inspection` looks at the frames.
 """

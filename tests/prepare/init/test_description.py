@@ -184,7 +184,7 @@ def test_what_cannot_be_seen_is_left_to_a_person(folder: Path) -> None:
     (folder / "cam3/static/GX010002.MP4").unlink()
     found = describe(folder)
     assert any("measure one printed square" in line for line in found.to_do)
-    assert any("no static recording was told for camera cam3" in line for line in found.to_do)
+    assert any("no static recording was recognised for camera cam3" in line for line in found.to_do)
     with pytest.raises(SplashbenchError, match=r"session\.toml: board\.square_metres: Field required"):
         from splashbench.prepare.session import Session
 
