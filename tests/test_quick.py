@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 #: What takes minutes by its nature: wheels are built.
-_SLOW = {"build"}
+_SLOW = {"installation"}
 
 
 def quick_files() -> list[Path]:
