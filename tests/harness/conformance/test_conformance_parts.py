@@ -17,7 +17,7 @@ from splashbench.harness.conformance.scene_copies import empty_masks, hidden, ke
 from splashbench.harness.conformance.stopping import StoppedRun, as_pairs, signal_faults
 from splashbench.harness.conformance.storage import storage_faults
 from splashbench.harness.conformance.subject import Answer
-from splashbench.harness.conformance.views import RenderedView
+from splashbench.harness.conformance.views import RenderedView, digest
 from splashbench.harness.runner import parse_overrides
 from splashbench.scene import Scene
 
@@ -107,6 +107,13 @@ def test_a_fault_of_the_loaded_model_alone_fails_the_check() -> None:
     evidence.fitted = Answer(ended_in="fit", reason="no memory")
     finding = model.views.finding(evidence)
     assert (finding.verdict, finding.detail) == (Verdict.NOT_TESTED, "the fit ended in fit: no memory")
+
+
+def test_a_digest_is_of_types_shapes_and_bytes() -> None:
+    zeros = np.zeros((2, 3), np.float32)
+    others = [zeros.T, zeros.astype(np.int32), zeros + 1, zeros[:1], None]
+    assert len({digest(zeros), *(digest(other) for other in others)}) == 6
+    assert digest(zeros) == digest(np.asfortranarray(zeros))
 
 
 def test_a_finding_names_three_faults_and_counts_the_rest() -> None:
