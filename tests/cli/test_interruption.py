@@ -47,7 +47,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(
     if name == "prepare":  # the clips are no rig: what its stages write stands in for them
         code = (
             "from splashbench.prepare import pipeline; from splashbench.files import write_text; "
-            "pipeline._Run.into = lambda self, made: write_text(made / 'train_meta.json', 'x' * 9999); " + code
+            "pipeline._run_stages = lambda *given: write_text(given[-1] / 'train_meta.json', 'x' * 9999); " + code
         )
     done = subprocess.run(command(*words[name], code=code), capture_output=True, text=True, timeout=60)
     lines = done.stderr.splitlines()
