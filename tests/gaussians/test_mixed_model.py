@@ -7,9 +7,10 @@ import pytest
 import torch
 from still_gaussians import StillGaussians
 
+from splashbench.gaussians.dynamic_model import Splats
 from splashbench.gaussians.fitting import FitHistory
 from splashbench.gaussians.mixed_model import MixedFitted
-from splashbench.scene import Scene
+from splashbench.scene import Camera, Scene
 from splashbench.synth.balls import ball_centers, write_balls_scene
 
 
@@ -58,6 +59,23 @@ class TestLiquid:
         assert render.alpha[row, column] < 0.05
         (ball,), _ = camera.project(ball_centers(balls.times[0])[:1])
         assert render.alpha[int(ball[1]), int(ball[0])] > 0.8
+
+    def test_opacity_is_of_the_drawn_liquid_in_whatever_order_it_is_drawn(
+        self, fitted: MixedFitted, balls: Scene, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        rows, draw = torch.tensor([4, 2, 1]), fitted.model.splats
+
+        def some(state: object, camera: Camera) -> Splats:
+            all_ = draw(state, camera)
+            return Splats(all_.means[rows], all_.factors[rows], all_.opacities[rows], all_.colors[rows], rows=rows)
+
+        monkeypatch.setattr(fitted.model, "splats", some)
+        camera = balls.cameras[balls.test[0]]
+        alpha = fitted.render(camera, float(balls.times[0])).alpha
+        pixels, _ = camera.project(ball_centers(balls.times[0]))
+        first, second, third = (alpha[int(v), int(u)] for u, v in pixels)
+        assert first < 0.05  # left out
+        assert min(second, third) > 0.8
 
     def test_silhouettes_are_of_their_cameras_own_times(self, late: Scene) -> None:
         training = late.training()

@@ -13,7 +13,7 @@ from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench_methods.splashsplat.carriers.visibility import seen_by_any
-from splashbench_methods.splashsplat.fields.gravity_cues import gravity_cues
+from splashbench_methods.splashsplat.fields.gravity_cues import GravityCues, gravity_cues
 from splashbench_methods.splashsplat.fields.jet import Jet, Slices, fit_jets, framed, open_floor, slices_of
 from splashbench_methods.splashsplat.fields.pool import LiquidPool
 from splashbench_methods.splashsplat.fields.vessel import Vessel, upright
@@ -368,3 +368,8 @@ def test_a_camera_sees_its_own_side_of_the_liquid_only():
     assert seen_by_any(phi, grid, points, [camera, behind], [None, None], 3).tolist() == [True, True, True, False]
     wall = np.full((camera.height, camera.width), 2.0, np.float32)
     assert not seen_by_any(phi, grid, points, [camera], [wall], 3).any()
+
+
+def test_a_jet_flies_down_to_the_pool_or_to_where_it_was_found():
+    cues = GravityCues(np.eye(3), [None, None], 0.3, None, np.array([np.nan, 0.1]), [])
+    assert [cues.jet_floor(t) for t in range(2)] == [0.3, 0.1]
