@@ -68,6 +68,15 @@ class TestDensity:
         assert spread.std(axis=0) == pytest.approx([0.5] * 3, rel=0.1)
         assert abs(np.corrcoef(spread[:400, 0], spread[400:, 0])[0, 1]) < 0.15
 
+    def test_a_faint_one_goes_without_a_clone_however_hard_the_loss_pulls(self) -> None:
+        model = StillGaussians(np.arange(9).reshape(3, 3) / 20)
+        with torch.no_grad():
+            model.opacity_logits[1] = -9.0
+        density = density_of(model)
+        pull(model, density, [1])
+        density.after_step(0)
+        np.testing.assert_allclose(model.positions.detach()[:, 0], [0.0, 0.3])
+
     def test_faint_ones_go_and_the_strongest_pulls_come_first_within_the_limit(self) -> None:
         model = StillGaussians(np.zeros((6, 3)))
         with torch.no_grad():

@@ -38,5 +38,5 @@ def gated(control: np.ndarray, factor: int, before: np.ndarray, after: np.ndarra
         gains += np.bincount(cell, gain, minlength=size)
         counts += np.bincount(cell, minlength=size)
     gains, counts = (gaussian_filter(values.reshape(coarse), 1.0) for values in (gains, counts))
-    believed = (gains > -_LOSS * counts) & (counts > 0)
+    believed = gains > -_LOSS * counts  # not where no liquid is counted: 0 is no gain
     return np.where(believed[..., None], control, np.float32(0))

@@ -240,6 +240,17 @@ def test_a_fit_that_leads_nowhere_is_dropped_and_one_that_leads_home_is_kept():
     assert velocity_at(gated(slow, 4, ball(17), ball(17.06)), 4, 20.0, 20.0, 20.0)[0] == pytest.approx(0.06)
 
 
+def test_motion_that_takes_arriving_liquid_away_from_where_it_was_is_dropped():
+    x = np.broadcast_to(np.arange(40.0)[:, None, None], (40, 40, 40)).astype(np.float32)
+    left = np.zeros((10, 10, 10, 3), np.float32)
+    left[..., 0] = -8
+    # Liquid up to x = 8, then up to 16. What is liquid now stays inside when it moves left. What arrives at 16 would
+    # have come from 24, farther outside than 16 itself.
+    gated_motion = gated(left, 4, x - 8, x - 16)
+    assert np.abs(velocity_at(gated_motion, 4, 15.0, 20.0, 20.0)).max() == 0
+    assert np.abs(velocity_at(gated_motion, 4, 36.0, 20.0, 20.0)).max() == 0  # no liquid tells anything there
+
+
 # The pool
 
 

@@ -12,7 +12,10 @@ from scipy import signal
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio.sync import (
+    PATH_SD_S,
+    RATE_PRIOR_SD,
     ClockFit,
+    _fit_line,
     estimate_sync,
     require_synced,
     sequence_sync_rms,
@@ -200,6 +203,16 @@ def test_track_status_forgives_a_clap_at_full_scale() -> None:
     track = record(sources(6, 6), 6, 0)
     track[RATE : RATE + 200] = 1.0
     assert track_status(track) == "ok"
+
+
+@pytest.mark.parametrize(("seconds", "share"), [(6.0, 0.45), (60.0, 0.99), (600.0, 1.0)])
+def test_the_less_time_windows_span_the_less_drift_is_believed(seconds: float, share: float) -> None:
+    """Bayes' rule for two Gaussians: the prior of clocks, and the change of path differences over the windows' time."""
+    times = np.linspace(0, seconds, 30)
+    _, clock_rate = _fit_line(times, 0.1 + 80e-6 * times, np.ones(30), RATE_PRIOR_SD)
+    expected = RATE_PRIOR_SD**2 / (RATE_PRIOR_SD**2 + PATH_SD_S**2 / times.var())
+    assert expected == pytest.approx(share, abs=0.02)
+    assert clock_rate - 1 == pytest.approx(80e-6 * expected, rel=0.01)
 
 
 def test_sequence_sync_rms_finds_what_the_fit_left_over() -> None:
