@@ -227,7 +227,7 @@ def test_a_damaged_file_is_one_line_naming_it(background: Background, tmp_path: 
 def test_anchors_without_evidence_are_dropped(balls: Scene, background: Background):
     # Every anchor left weighs on some seen training pixel, so none lies behind all cameras.
     positions = background.model.positions.numpy()
-    assert 100 < len(positions) <= SETTINGS.anchors
+    assert 100 < len(positions) <= SETTINGS.max_anchors
     seen = np.zeros(len(positions), bool)
     for name in balls.train:
         camera = balls.cameras[name]

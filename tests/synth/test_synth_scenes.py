@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from splashbench.cli import synth as command
 from splashbench.cli.main import main
+from splashbench.cli.synth import scene as command
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
 from splashbench.synth.recording.plan import RecordingOptions, make_plan

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splashbench import child
 from splashbench.errors import SplashbenchError
 from splashbench.synth.imaging.geometry import bowl_mesh
 from splashbench.synth.liquid import simulation
@@ -48,7 +49,7 @@ def test_a_crash_of_the_solver_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     stub = tmp_path / "crash.sh"
     stub.write_text("#!/bin/sh\nkill -SEGV $$\n")
     stub.chmod(0o755)
-    monkeypatch.setattr(simulation.sys, "executable", str(stub))
+    monkeypatch.setattr(child.sys, "executable", str(stub))
     with pytest.raises(SplashbenchError, match="signal 11") as caught:
         start(QUICK, bowl_mesh(), tmp_path).finish()
     assert "\n" not in str(caught.value)
@@ -58,7 +59,7 @@ def test_a_solver_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.Monkey
     stub = tmp_path / "hang.sh"
     stub.write_text("#!/bin/sh\nexec sleep 60\n")
     stub.chmod(0o755)
-    monkeypatch.setattr(simulation.sys, "executable", str(stub))
+    monkeypatch.setattr(child.sys, "executable", str(stub))
     with pytest.raises(SplashbenchError, match="had not finished"):
         start(QUICK, bowl_mesh(), tmp_path, timeout=0.5).finish()
 
@@ -67,7 +68,7 @@ def test_what_the_solver_says_last_reaches_the_user(tmp_path: Path, monkeypatch:
     stub = tmp_path / "complain.sh"
     stub.write_text("#!/bin/sh\necho first >&2\necho no module named pysplishsplash >&2\nexit 1\n")
     stub.chmod(0o755)
-    monkeypatch.setattr(simulation.sys, "executable", str(stub))
+    monkeypatch.setattr(child.sys, "executable", str(stub))
     with pytest.raises(SplashbenchError, match="no module named pysplishsplash"):
         start(QUICK, bowl_mesh(), tmp_path).finish()
 
