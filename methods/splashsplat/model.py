@@ -161,7 +161,7 @@ class Liquid:
             decoder = Decoder(
                 DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); fit the scene again") from None
         ranks = {"starts": 1, "ids": 1, "positions": 2, "deformation": 3, "phi": 1}
         rows = read_npz(directory / "carriers.npz", ranks)

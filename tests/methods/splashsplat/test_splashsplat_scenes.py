@@ -193,6 +193,14 @@ def test_a_model_of_version_0_1_is_read_though_it_spells_colour(balls_copy: Path
     np.testing.assert_array_equal(loaded.render(camera, 0.0).rgb, fitted.render(camera, 0.0).rgb)
 
 
+def test_a_model_whose_header_is_broken_is_named(tmp_path: Path):
+    grid = {"shape": [2, 2, 2], "origin": [0, 0, 0], "voxel": 1.0}
+    header = {"format": 3, "grid": grid, "times": [0.0], "factor": 4, "carriers": 0, "carried": True, "decoder": []}
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
+    with pytest.raises(SplashbenchError, match=r"liquid\.json is not a SplashSplat model"):
+        Liquid.load(tmp_path)
+
+
 def test_stages_of_the_fit_are_told(balls_copy: Path):
     cut(balls_copy, 2)
     run = Run(seed=0)
