@@ -62,12 +62,3 @@ def each(function: Callable[[Item], Value], items: Iterable[Item]) -> list[Value
     if thread_count() == 1:
         return [function(item) for item in items]
     return list(_pool().map(function, items))
-
-
-def on_all_threads(kernel: Callable[[int, int], None]) -> None:
-    """Call kernel(worker, workers) for every worker and wait; the last one runs on the calling thread."""
-    workers = thread_count()
-    futures = [_pool().submit(kernel, worker, workers) for worker in range(workers - 1)]
-    kernel(workers - 1, workers)
-    for future in futures:
-        future.result()

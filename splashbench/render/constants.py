@@ -6,8 +6,6 @@ and the largest alpha (0.99). The CPU kernel has these numbers in kernel/constan
 
 from __future__ import annotations
 
-import math
-
 NEAR_PLANE = 0.01
 """Gaussians whose centre lies nearer than this along the optical axis are not drawn; scene units."""
 
@@ -25,9 +23,6 @@ MIN_TRANSMITTANCE = 1e-4
 
 JACOBIAN_MARGIN = 0.15
 """The projection is linearised at most this share of the image size beyond the image's edges."""
-
-LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
-LOG2_MAX_ALPHA = math.log2(MAX_ALPHA)
 
 TILE_WIDTH = 64
 TILE_HEIGHT = 32
