@@ -38,10 +38,10 @@ def settle_turn(
     scene [3].
     """
     axis_of_mesh = body.vertical(axis)
-    shaxis_of_mesh = [find_contour(np.isfinite(view.depth(mesh, stance))) for view in views]
+    outlines = [find_contour(np.isfinite(view.depth(mesh, stance))) for view in views]
 
     def alike(degrees: int) -> bool:
-        return _looks_alike(mesh, views, shaxis_of_mesh, stance.turned(axis_of_mesh, float(np.deg2rad(degrees))))
+        return _looks_alike(mesh, views, outlines, stance.turned(axis_of_mesh, float(np.deg2rad(degrees))))
 
     vertical = stance.rotation @ axis_of_mesh
     # The turn that brings the rotation nearest to the preferred one: the largest trace of preferred^T A(turn) R.

@@ -4,7 +4,7 @@ Faces that walls cover in part count by their open share (Batty, Bertails and Br
 for Accurate Solid-Fluid Coupling", 2007). Cells without a particle are air at pressure 0, and so is what lies beyond
 the grid. The preconditioner is the modified incomplete Cholesky factor of Bridson, "Fluid Simulation for Computer
 Graphics" (2008). Everything runs on one thread in storage order: the same cells give the same bits. Grid and faces: see
-flip_grid.py. Time step and density are folded into the pressure, so that it is a velocity potential.
+grid.py. Time step and density are folded into the pressure, so that it is a velocity potential.
 """
 
 from __future__ import annotations

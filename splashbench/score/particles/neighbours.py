@@ -74,7 +74,7 @@ def _keys(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _cell_size(offsets: NDArray[np.float64], target: float, radius: float) -> float:
-    """Edge of cells that hold about `wanted` points where the median point is; hardly above `radius` at most."""
+    """Edge of cells that hold about `target` points where the median point is; hardly above `radius` at most."""
     size = (1 + 2 * _MARGIN) * radius
     for _ in range(_SHRINKINGS):
         cells = _cells(offsets, size)
@@ -120,7 +120,7 @@ def _collect(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _smallest_first(values: np.ndarray, count: int, n_smallest: int) -> None:
-    """Reorder values[:count] so that the `wanted` smallest come first (Hoare's selection)."""
+    """Reorder values[:count] so that the `n_smallest` smallest come first (Hoare's selection)."""
     low, high = 0, count - 1
     while low < high:
         pivot = values[(low + high) // 2]
