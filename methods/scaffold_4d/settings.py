@@ -50,3 +50,4 @@ class Scaffold4DSettings(DynamicFitSettings):
     hull_points: int = Field(default=10_000, ge=0, le=5_000_000)
     grow_from: float = Field(default=0.0, ge=0, le=1)
     grow_until: float = Field(default=0.0, ge=0, le=1)
+    grow_every: int = Field(default=100, ge=1, le=100_000)

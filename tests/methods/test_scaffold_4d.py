@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from splashbench.errors import SplashbenchError
 from splashbench.gaussians.initialization import StartingPoints
 from splashbench.gaussians.mixed_model import MixedFitted
 from splashbench.gaussians.torch_threads import one_torch_thread
@@ -102,6 +103,11 @@ def test_children_are_those_of_the_formulas(base_color: bool) -> None:
             assert int(splats.rows[j]) == i * 3 + k
             np.testing.assert_allclose(model.means(tau)[i * 3 + k].detach(), splats.means[j].detach())
     assert 0 < shown < len(model)
+
+
+def test_growth_comes_at_least_every_so_many_steps() -> None:
+    with pytest.raises(SplashbenchError, match="grow_every"):
+        Scaffold4DSettings.preset("quick", {"grow_every": 100_001})
 
 
 def test_static_anchors_last_and_those_of_the_hull_come_and_go() -> None:
