@@ -22,11 +22,11 @@ from torch import Tensor, nn
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
+from splashbench.files.ply import PointCloud, read_point_cloud
 from splashbench.gaussians.mixed_model import MODEL_FILE, load_tables
 from splashbench.gaussians.official.checkpoint import fill, read_weights
 from splashbench.gaussians.official.model import OfficialFitted, OfficialModel, require_finite
 from splashbench.gaussians.official.output_folder import TrainingArguments, last_point_cloud
-from splashbench.gaussians.official.point_cloud import PointCloud, read_point_cloud
 from splashbench.harness.external.importers import Importer
 from splashbench.scene import Camera, TrainingScene
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
+from splashbench.files.ply import write_mesh
 from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
 from splashbench.synth.imaging.geometry import Mesh, bowl_mesh, tank_mesh
 from splashbench.synth.imaging.lens import LensCamera
@@ -26,7 +27,6 @@ from splashbench.synth.liquid.simulation import Pour
 from splashbench.synth.liquid.surface import liquid_surface
 from splashbench.synth.liquid.trajectory import Trajectory
 from splashbench.synth.recording.plan import CAMERAS, GRAVITY, TEST, TRAIN, RecordingOptions, make_plan
-from splashbench.synth.recording.session import write_ply
 from splashbench.synth.recording.video import SensorNoise
 
 _POINTS_PER_VIEW = 4000
@@ -189,7 +189,7 @@ def make_scene(
         (staging / "truth").mkdir()
         _true_particles(trajectory, shown).save(staging / "truth" / "particles.npz")
         container = recipe.container.mesh()
-        write_ply(staging / "truth" / "container.ply", container.vertices, container.faces)
+        write_mesh(staging / "truth" / "container.ply", container.vertices, container.faces)
     return Scene.open(out)
 
 

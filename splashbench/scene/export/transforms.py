@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from splashbench.files import write_json
+from splashbench.files.ply import write_colored_points
 from splashbench.scene.export.content import Export, ExportView, pinhole
-from splashbench.scene.export.ply import write_ply
 
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _POINTS = "points3d.ply"
@@ -25,7 +25,7 @@ def write_blender(export: Export) -> None:
     export.write_images("images", "masks")
     for split, views in (("train", export.train_views), ("test", export.test_views)):
         write_json(export.directory / f"transforms_{split}.json", _clocked(export, views, ending="", blender=True))
-    write_ply(export.directory / _POINTS, export.points.cloud())
+    write_colored_points(export.directory / _POINTS, export.points.cloud())
 
 
 def write_nerfstudio(export: Export) -> None:
@@ -49,7 +49,7 @@ def write_nerfstudio(export: Export) -> None:
     write_json(export.directory / "transforms.json", content)
     if not with_images:
         write_json(export.directory / "transforms_test.json", _clocked(export, test, ending=".png"))
-    write_ply(export.directory / _POINTS, export.points.cloud())
+    write_colored_points(export.directory / _POINTS, export.points.cloud())
 
 
 def _path(view: ExportView, ending: str) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, write_model
+from splashbench.files.ply import write_mesh
 from splashbench.progress import track
 from splashbench.synth.imaging.geometry import bowl_mesh
 from splashbench.synth.imaging.room import board_pose
@@ -132,7 +133,7 @@ def _write_truth(plan: RecordingPlan, trajectory: Trajectory, first_seen: float,
     write_model(truth / "truth.json", file)
     _write_particles(truth / "particles.npz", plan, trajectory)
     bowl = bowl_mesh()
-    write_ply(truth / "container.ply", bowl.vertices, bowl.faces)
+    write_mesh(truth / "container.ply", bowl.vertices, bowl.faces)
 
 
 def _lens(camera: Any) -> dict[str, Any]:
@@ -158,18 +159,6 @@ def _write_particles(path: Path, plan: RecordingPlan, trajectory: Trajectory) ->
         active=active,
         times=since_start + planned.POUR_AT,
     )
-
-
-def write_ply(path: Path, vertices: Any, faces: Any) -> None:
-    """Write a triangle mesh (vertices [V, 3] metres, faces [F, 3]) as ASCII PLY."""
-    head = (
-        f"ply\nformat ascii 1.0\ncomment metres, y up\nelement vertex {len(vertices)}\nproperty float x\n"
-        f"property float y\nproperty float z\nelement face {len(faces)}\nproperty list uchar int vertex_indices\n"
-        "end_header\n"
-    )
-    body = ["{:.6f} {:.6f} {:.6f}".format(*vertex) for vertex in vertices.tolist()]
-    body += ["3 {} {} {}".format(*face) for face in faces.tolist()]
-    path.write_text(head + "\n".join(body) + "\n", encoding="ascii")
 
 
 def _description(plan: RecordingPlan) -> dict[str, Any]:

@@ -18,9 +18,9 @@ from official_comparison import (
 )
 
 from splashbench.errors import SplashbenchError
+from splashbench.files.ply import read_point_cloud
 from splashbench.gaussians.official.checkpoint import read_weights
 from splashbench.gaussians.official.output_folder import TrainingArguments
-from splashbench.gaussians.official.point_cloud import read_point_cloud
 from splashbench.scene import Scene
 from splashbench_methods.deformable_3dgs.official import OfficialDeformable3DGS
 

@@ -1,7 +1,8 @@
-"""Gaussians and anchors as published codes write them: a binary .ply, a row per point and a number per property.
+"""Point clouds and meshes as .ply (Turk, The PLY Polygon File Format, 1994).
 
-The layout is Turk's (The PLY Polygon File Format, 1994). Such a file comes from a stranger: its header is held against
-the file's size before anything is read.
+A point cloud is binary: a row per point and a number per property. Published codes write Gaussians and anchors so, and
+ask for their first points so. A file that is read comes from a stranger: its header is held against the file's size
+before anything else is read. The usual library, plyfile, has a licence (GPL) that does not go with this project's.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import require_plain_file
+from splashbench.files.atomic import atomic_path
+from splashbench.files.places import require_plain_file
 
 #: More points than this are no reconstruction that could be rendered.
 MAX_POINTS = 20_000_000
@@ -25,6 +27,10 @@ _TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_COLORED_POINT = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
+)
+_WRITTEN_TYPES = {"<f4": "float", "|u1": "uchar"}
 _NAME = re.compile(r"\w{1,64}", re.ASCII)
 _END = re.compile(rb"^end_header\r?\n", re.MULTILINE)
 
@@ -121,3 +127,32 @@ def _header(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
     if not 0 < count <= MAX_POINTS:
         raise SplashbenchError(f"{path} has {count} points, not 1 to {MAX_POINTS}; give a model that was fitted")
     return count, np.dtype([(name, order + kind) for name, kind in fields.items()])
+
+
+def write_colored_points(path: Path, points: NDArray[np.float64]) -> None:
+    """Write `points` [N, 6] (x, y, z, r, g, b in [0, 1]), atomically.
+
+    Codes built on 3D Gaussian Splatting ask for normals, too; they are zero.
+    """
+    vertices = np.zeros(len(points), _COLORED_POINT)
+    for column, name in enumerate(("x", "y", "z")):
+        vertices[name] = points[:, column]
+    for column, name in enumerate(("red", "green", "blue"), 3):
+        vertices[name] = np.rint(np.clip(points[:, column], 0, 1) * 255)
+    properties = [f"property {_WRITTEN_TYPES[vertices.dtype[name].str]} {name}" for name in _COLORED_POINT.names or ()]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode() + vertices.tobytes())
+
+
+def write_mesh(path: Path, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
+    """Write a triangle mesh (`vertices` [V, 3] in metres, y up; `faces` [F, 3]) as text that people can read."""
+    head = (
+        f"ply\nformat ascii 1.0\ncomment metres, y up\nelement vertex {len(vertices)}\nproperty float x\n"
+        f"property float y\nproperty float z\nelement face {len(faces)}\nproperty list uchar int vertex_indices\n"
+        "end_header\n"
+    )
+    body = ["{:.6f} {:.6f} {:.6f}".format(*vertex) for vertex in vertices.tolist()]
+    body += ["3 {} {} {}".format(*face) for face in faces.tolist()]
+    with atomic_path(path) as temporary:
+        temporary.write_text(head + "\n".join(body) + "\n", encoding="ascii")
