@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import runpy
 from pathlib import Path
 
 import pytest
 
 from splashbench.harness.discovery import load_method
 
-TABLE = Path(__file__).parents[2] / "leaderboards" / "synthetic.csv"
+ROOT = Path(__file__).parents[2]
+TABLE = ROOT / "leaderboards" / "synthetic.csv"
 MASKS_ALONE = {"container": False, "pool": False, "ballistic": False}
 
 
@@ -31,3 +33,10 @@ def rows() -> list[tuple[str, str, str]]:
 def test_a_row_has_the_settings_that_its_method_has_today(method: str, preset: str, digest: str) -> None:
     told = [{}, MASKS_ALONE] if method == "splashsplat" else [{}]
     assert digest in [digest_of(method, preset, settings) for settings in told]
+
+
+def test_the_rows_of_masks_alone_are_told_by_their_digest() -> None:
+    digest = digest_of("splashsplat", "best", MASKS_ALONE)
+    assert ("splashsplat", "best", digest) in rows()
+    assert runpy.run_path(str(ROOT / "docs" / "tools" / "pictures.py"))["MASKS_ALONE"] == digest
+    assert f"`settings_digest` {digest}" in (ROOT / "leaderboards" / "README.md").read_text(encoding="utf-8")
