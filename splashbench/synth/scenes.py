@@ -18,10 +18,10 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.files.ply import write_mesh
 from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
-from splashbench.synth.imaging.geometry import Mesh, bowl_mesh, tank_mesh
+from splashbench.synth.imaging.geometry import Mesh, basin_mesh, bowl_mesh, dish_mesh, tank_mesh
 from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom
-from splashbench.synth.imaging.room import CaptureRoom, pour_room, tank_room
+from splashbench.synth.imaging.room import CaptureRoom, dish_room, glossy_room, pour_room, tank_room
 from splashbench.synth.liquid import simulation
 from splashbench.synth.liquid.simulation import Pour
 from splashbench.synth.liquid.surface import liquid_surface
@@ -47,6 +47,8 @@ class SynthContainer:
 
 BOWL = SynthContainer(bowl_mesh, pour_room, transparent=False)
 TANK = SynthContainer(tank_mesh, tank_room, transparent=True)
+GLOSSY_BASIN = SynthContainer(basin_mesh, glossy_room, transparent=False)
+PAINTED_DISH = SynthContainer(dish_mesh, dish_room, transparent=False)
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,8 @@ DEFAULT_SIZE = (480, 320)
 _NOZZLE = (-0.08, 0.36, 0.0)
 # With -78 degrees and 0.85 m/s, what splashes over the bowl's rim is drops: faster or flatter, a slosh goes over.
 _NOZZLE_OVER_BOWL = (-0.065, 0.36, 0.0)
+_NOZZLE_OVER_BASIN = (-0.085, 0.36, 0.0)
+_NOZZLE_OVER_DISH = (-0.06, 0.36, 0.0)
 # So low that nothing splashes; for liquid that is all there before the first frame.
 _NOZZLE_IN_BOWL = (-0.04, 0.17, 0.0)
 
@@ -108,6 +112,20 @@ RECIPES: dict[str, Recipe] = {
         Pour(emit_until=0.95, particle_radius=0.0035, stream_diameter=0.028, speed=0.8, nozzle=_NOZZLE_IN_BOWL),
         1.0,
         (100.0,),
+    ),
+    "glossy_bowl": Recipe(
+        "a lively pour into a glossy basin without texture, in which the room is mirrored",
+        Pour(emit_until=1.35, speed=1.1, stream_diameter=0.026, nozzle=_NOZZLE_OVER_BASIN, angle_degrees=-74.0),
+        0.1,
+        (33.0,),
+        GLOSSY_BASIN,
+    ),
+    "clear_liquid": Recipe(
+        "a clear liquid poured into a painted dish, whose pattern is seen through it",
+        Pour(emit_until=1.6, speed=0.7, stream_diameter=0.022, nozzle=_NOZZLE_OVER_DISH, angle_degrees=-80.0),
+        0.1,
+        (40.0,),
+        PAINTED_DISH,
     ),
 }
 

@@ -178,6 +178,6 @@ def test_thin_clear_liquid_shows_what_lies_behind_it_and_thick_liquid_its_dye() 
 
     contrast = [(seen(mm, 0.8) - seen(mm, 0.2)) / 0.6 for mm in (0.0, 5.0, 50.0)]
     assert np.allclose(contrast[0], 0.98, atol=1e-4)  # all but what the surface mirrors
-    assert np.allclose(contrast[1], 0.98 * np.exp(-0.005 * shading.LIQUID_ABSORPTION), atol=1e-4)
+    assert np.allclose(contrast[1], 0.98 * np.exp(-0.005 * shading.BLUE.absorption), atol=1e-4)
     assert contrast[2][0] < 0.05
     assert np.allclose(seen(1e4, 0.8), shading.wet(normal, view, lit, openness)[0], atol=1e-5)

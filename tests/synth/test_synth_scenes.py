@@ -61,7 +61,10 @@ def test_the_particles_lie_in_every_views_masks(scene: Scene) -> None:
             assert np.mean(near) > 0.95
 
 
-@pytest.mark.parametrize(("name", "milliseconds"), [("opaque_bowl", 33), ("thin_stream", 40), ("still_pool", 100)])
+@pytest.mark.parametrize(
+    ("name", "milliseconds"),
+    [("opaque_bowl", 33), ("thin_stream", 40), ("still_pool", 100), ("glossy_bowl", 33), ("clear_liquid", 40)],
+)
 def test_steps_are_as_real_scenes_have_them(name: str, milliseconds: float) -> None:
     times = RECIPES[name].times(50)
     assert len(times) == 50

@@ -17,16 +17,18 @@ examples:
   splashbench synth scene glass_tank scenes/tank --step 33 --timesteps 20
 
 scenes, and the time between their frames:
-  balls        balls in free flight, 8 frames within a third of a second
-  opaque_bowl  a pour that splashes in an opaque bowl, 33 ms
-  glass_tank   a pour into a glass tank, seen through its walls, 50 to 83 ms, uneven as in real captures
-  thin_stream  a stream a centimetre thick, 40 ms
-  still_pool   a pool coming to rest, 100 ms
+  balls         balls in free flight, 8 frames within a third of a second
+  opaque_bowl   a pour that splashes in an opaque bowl, 33 ms
+  glass_tank    a pour into a glass tank, seen through its walls, 50 to 83 ms, uneven as in real captures
+  thin_stream   a stream a centimetre thick, 40 ms
+  still_pool    a pool coming to rest, 100 ms
+  glossy_bowl   a lively pour into a glossy basin without texture, in which the room is mirrored, 33 ms
+  clear_liquid  a clear liquid in a painted dish, whose pattern is seen through it, 40 ms
 """
 # The names of splashbench.synth.scenes.RECIPES, repeated here so that `--help` need not import them, and the scene
 # that needs no simulation.
 _BALLS = "balls"
-_SCENES = (_BALLS, "opaque_bowl", "glass_tank", "thin_stream", "still_pool")
+_SCENES = (_BALLS, "opaque_bowl", "glass_tank", "thin_stream", "still_pool", "glossy_bowl", "clear_liquid")
 
 
 def register(actions: argparse._SubParsersAction) -> None:

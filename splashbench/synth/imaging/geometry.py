@@ -21,11 +21,30 @@ ARC_ELEVATION_DEGREES = 22.0
 ARC_ORDER = (0, 2, 3, 5, 6, 1, 4)
 LOOK_AT = np.array([0.0, 0.11, 0.0])
 
-BOWL_RIM_RADIUS = 0.108
-BOWL_RIM_HEIGHT = 0.088
-_BOWL_WALL = 0.009
-_BOWL_FOOT_RADIUS = 0.05
-_BOWL_FOOT_HEIGHT = 0.008
+
+@dataclass(frozen=True)
+class BowlShape:
+    """A bowl in metres: its rim, its foot, its wall, and how steeply the wall rises.
+
+    `floor` is the height of the inside at the axis; from there the height grows with the radius to the power
+    `inner_power` on the inside and `outer_power` on the outside, above a foot `foot_height` high.
+    """
+
+    rim_radius: float = 0.108
+    rim_height: float = 0.088
+    wall: float = 0.009
+    foot_radius: float = 0.05
+    foot_height: float = 0.008
+    floor: float = 0.013
+    inner_power: float = 2.2
+    outer_power: float = 1.7
+
+
+BOWL = BowlShape()
+#: Wider and lower than `BOWL`, with a flat floor and a steep wall.
+BASIN = BowlShape(0.122, 0.078, 0.008, 0.088, 0.006, 0.012, inner_power=4.5, outer_power=1.6)
+#: A round dish, lower and steeper still.
+DISH = BowlShape(0.128, 0.064, 0.007, 0.108, 0.004, 0.009, inner_power=8.0, outer_power=1.5)
 
 TANK_SIZE = np.array([0.22, 0.14, 0.16])  # of the outside: width, height, depth
 TANK_WALL = 0.005
@@ -59,18 +78,30 @@ class Quad:
         return vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
-def bowl_mesh(segments: int = 72, rings: int = 20) -> Mesh:
+def bowl_mesh(shape: BowlShape = BOWL, segments: int = 72, rings: int = 20) -> Mesh:
     """A thick, footed bowl as a closed surface of revolution about the y axis, its foot on y = 0."""
+    rim, height, foot_radius, foot_height = shape.rim_radius, shape.rim_height, shape.foot_radius, shape.foot_height
     s = np.linspace(0.0, 1.0, rings)
-    inner = np.stack([(BOWL_RIM_RADIUS - _BOWL_WALL) * s, 0.013 + (BOWL_RIM_HEIGHT - 0.013) * s**2.2], axis=1)
+    inside = shape.floor + (height - shape.floor) * s**shape.inner_power
+    inner = np.stack([(rim - shape.wall) * s, inside], axis=1)
     angle = np.linspace(np.pi, 0.0, 7)[1:-1]  # the rounded lip, from the inside to the outside
-    half = _BOWL_WALL / 2
-    lip = np.stack([BOWL_RIM_RADIUS - half + half * np.cos(angle), BOWL_RIM_HEIGHT + half * np.sin(angle)], axis=1)
+    half = shape.wall / 2
+    lip = np.stack([rim - half + half * np.cos(angle), height + half * np.sin(angle)], axis=1)
     back = s[::-1]
-    outer_radius = _BOWL_FOOT_RADIUS + (BOWL_RIM_RADIUS - _BOWL_FOOT_RADIUS) * back
-    outer = np.stack([outer_radius, _BOWL_FOOT_HEIGHT + (BOWL_RIM_HEIGHT - _BOWL_FOOT_HEIGHT) * back**1.7], axis=1)
-    foot = np.array([[_BOWL_FOOT_RADIUS, 0.0], [_BOWL_FOOT_RADIUS / 2, 0.0], [0.0, 0.0]])
+    outside = foot_height + (height - foot_height) * back**shape.outer_power
+    outer = np.stack([foot_radius + (rim - foot_radius) * back, outside], axis=1)
+    foot = np.array([[foot_radius, 0.0], [foot_radius / 2, 0.0], [0.0, 0.0]])
     return revolve(np.concatenate([inner, lip, outer, foot]), segments)
+
+
+def basin_mesh() -> Mesh:
+    """The bowl `BASIN`, finely enough for a smooth mirror."""
+    return bowl_mesh(BASIN, segments=96, rings=48)
+
+
+def dish_mesh() -> Mesh:
+    """The bowl `DISH`."""
+    return bowl_mesh(DISH, segments=96, rings=48)
 
 
 def tank_mesh() -> Mesh:

@@ -8,7 +8,7 @@ container of glass (`splashbench.synth.imaging.glass`) hides nothing: it is laid
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,7 @@ class TracedRoom:
         for index in np.unique(hits.geometry):
             chosen = hits.geometry == index
             if index == self.bowl_index:
-                albedo[chosen], normal[chosen] = self._bowl_surface(hits, chosen)
+                albedo[chosen], normal[chosen] = self._bowl_surface(points[chosen], hits, chosen)
             elif index >= 0:
                 quad = self.room.quads[index]
                 offset = points[chosen] - quad.corner.astype(np.float32)
@@ -68,17 +68,36 @@ class TracedRoom:
                 albedo[chosen] = sample(quad.texture, u, v)
         return albedo, normal
 
-    def _bowl_surface(self, hits: Hits, chosen: NDArray[np.bool_]) -> tuple[Vectors, Vectors]:
-        bowl, colors = self.room.bowl, self.room.bowl_albedo
+    def mirrored(self, points: Vectors, directions: Vectors) -> Vectors:
+        """Light [R, 3] that reaches `points` from unit `directions`: from the room, or from what surrounds it."""
+        light = self.room.light
+        color = shading.surroundings(directions, light)
+        hits = self.tracer.nearest(points, directions)
+        met = hits.geometry >= 0
+        hits = Hits(*(getattr(hits, field.name)[met] for field in fields(hits)))
+        reached = points[met] + hits.distance[:, None] * directions[met]
+        lit, shaded = shading.matte(*self.surface(reached, hits), light)
+        lifted = reached + _OFFSET * hits.normal
+        dark = self.tracer.occluded(lifted, np.broadcast_to(light.towards, reached.shape))
+        color[met] = np.where(dark[:, None], shaded, lit)
+        return color
+
+    def _bowl_surface(self, points: Vectors, hits: Hits, chosen: NDArray[np.bool_]) -> tuple[Vectors, Vectors]:
+        bowl, colors, texture = self.room.bowl, self.room.bowl_albedo, self.room.bowl_texture
         assert bowl is not None
-        assert colors is not None
         corners = bowl.faces[hits.triangle[chosen]]
         weights = hits.weights[chosen][..., None]
         normal = (bowl.normals[corners] * weights).sum(axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         away = np.einsum("ij,ij->i", normal, hits.normal[chosen]) < 0
         normal[away] *= -1
-        return (colors[corners] * weights).sum(axis=1), normal
+        if texture is None:
+            assert colors is not None
+            return (colors[corners] * weights).sum(axis=1), normal
+        azimuth = np.arctan2(points[:, 0], points[:, 2]) / (2 * np.pi) + 0.5
+        shape = self.room.bowl_shape
+        along = (np.hypot(points[:, 0], points[:, 2]) + points[:, 1]) / (shape.rim_radius + shape.rim_height)
+        return sample(texture, azimuth.astype(np.float32), along), normal
 
 
 class RoomView:
@@ -98,14 +117,21 @@ class RoomView:
         points = np.asarray(self._eye + reach[:, None] * directions, np.float32)
         albedo, normal = traced.surface(points, hits)
         lifted = points + _OFFSET * hits.normal
-        light, shade = shading.matte(albedo, normal)
+        lamp = traced.room.light
+        light, shade = shading.matte(albedo, normal, lamp)
         light -= shade
         # The sky changes slowly over a surface: one sample of each pixel speaks for all of them.
         middle = slice(s * s // 2, None, s * s)
         shade *= np.repeat(openness(traced.tracer, lifted[middle]), s * s)[:, None]
-        lit = hit & ~traced.tracer.occluded(lifted, np.broadcast_to(shading.TO_LIGHT, points.shape))
-        color = shade + np.where(lit[:, None], light, 0)
+        lit = hit & ~traced.tracer.occluded(lifted, np.broadcast_to(lamp.towards, points.shape))
         on_bowl = hits.geometry == traced.bowl_index
+        if traced.room.glaze is not None:
+            coat, view = traced.room.glaze, directions[on_bowl]
+            share = coat.share(normal[on_bowl], view)
+            light[on_bowl] = (1 - share) * light[on_bowl] + coat.glint(normal[on_bowl], view, lamp)
+            seen = traced.mirrored(lifted[on_bowl], shading.mirrored(normal[on_bowl], view))
+            shade[on_bowl] = (1 - share) * shade[on_bowl] + share * seen
+        color = shade + np.where(lit[:, None], light, 0)
         self._panes = traced.glass.along(self._eye, directions) if traced.glass is not None else None
         on_container = on_bowl if self._panes is None else self._panes.met
         self._distance = hits.distance.reshape(-1, s * s)
@@ -131,16 +157,16 @@ class RoomView:
             return LiquidFrame(self.image, mask)
         tracer = Tracer([(liquid.vertices, liquid.faces)])
         near = self._pixels_near(liquid.vertices)
-        on_table = liquid.vertices - shading.TO_LIGHT * (liquid.vertices[:, 1:2] / shading.TO_LIGHT[1])
+        to_light = self.traced.room.light.towards
+        on_table = liquid.vertices - to_light * (liquid.vertices[:, 1:2] / to_light[1])
         pixels = np.flatnonzero(near | self._pixels_near(on_table) | self._on_bowl)
         color = self._color[pixels]
         distance = np.full(color.shape[:2], FAR, np.float32)
         lit = self._lit[pixels]
         darkened = np.zeros_like(lit)
-        darkened[lit] = tracer.occluded(
-            self._lifted[pixels][lit], np.broadcast_to(shading.TO_LIGHT, (int(np.count_nonzero(lit)), 3))
-        )
-        color[darkened] = self._shade[pixels][darkened]
+        lifted = self._lifted[pixels]
+        darkened[lit] = tracer.occluded(lifted[lit], np.broadcast_to(to_light, (int(np.count_nonzero(lit)), 3)))
+        color[darkened] = self._in_shadow(tracer, lifted[darkened], color[darkened], self._shade[pixels][darkened])
         seen = np.flatnonzero(near[pixels])
         distance[seen], color[seen] = self._wetted(liquid, tracer, pixels[seen], color[seen])
         if self._panes is not None:
@@ -150,6 +176,14 @@ class RoomView:
         image.reshape(-1, 3)[pixels] = to_srgb(_sample_means(color))
         mask.ravel()[pixels] = (distance < FAR).mean(axis=1) >= 0.5
         return LiquidFrame(image, mask)
+
+    def _in_shadow(self, tracer: Tracer, points: Vectors, color: Vectors, shade: Vectors) -> Vectors:
+        """The room's colour [R, 3] where liquid stands between `points` and the key light: `color` if it did not."""
+        dye = self.traced.room.dye
+        if not dye.tints_shadow:
+            return shade
+        depth = depth_above(tracer, points, np.broadcast_to(self.traced.room.light.towards, points.shape))
+        return np.asarray(shade + (color - shade) * np.exp(-dye.absorption * depth[:, None]), np.float32)
 
     def _wetted(
         self, liquid: Mesh, tracer: Tracer, pixels: NDArray[np.int_], color: Vectors
@@ -167,20 +201,21 @@ class RoomView:
         normal = sum(liquid.normals[corners[:, k]] * weights[:, k : k + 1] for k in range(3))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + np.float32(1e-9)
         lifted = points + _OFFSET * hits.normal[first]
-        towards = np.broadcast_to(shading.TO_LIGHT, points.shape)
+        room = self.traced.room
+        towards = np.broadcast_to(room.light.towards, points.shape)
         lit = ~(tracer.occluded(lifted, towards) | self.traced.tracer.occluded(lifted, towards))
         wet = first.reshape(color.shape[:2])
-        in_bowl = self.traced.room.bowl is not None
-        openness = shading.bowl_openness(points) if in_bowl else np.ones(len(points), np.float32)
+        alone = np.ones(len(points), np.float32)
+        openness = shading.bowl_openness(points, room.bowl_shape) if room.bowl is not None else alone
         behind = None
-        if self.traced.room.clear_liquid:
+        if room.clear_liquid:
             light = color[wet]
             if self._panes is not None:
                 panes = self._panes.of(self._samples_of(pixels)[first])
                 light = panes.through(light, hits.distance[first], FAR)
             reach = self._distance[pixels].ravel()[first] - hits.distance[first]
             behind = shading.Behind(light, thickness(tracer, points, view, reach))
-        color[wet] = shading.wet(normal, view, lit, openness, behind)
+        color[wet] = shading.wet(normal, view, lit, openness, behind, room.dye, room.light)
         return np.where(first, hits.distance, FAR).reshape(wet.shape), color
 
     def _samples_of(self, pixels: NDArray[np.int_]) -> NDArray[np.int_]:
@@ -226,6 +261,22 @@ def thickness(tracer: Tracer, points: Vectors, directions: Vectors, reach: NDArr
             total[rays] += np.maximum(np.minimum(crossing, reach[rays]) - travelled[rays], 0)
         travelled[rays], inside = crossing, not inside
     return total
+
+
+def depth_above(tracer: Tracer, points: Vectors, directions: Vectors) -> NDArray[np.float32]:
+    """Metres of liquid [R] along rays from `points` [R, 3] that end outside it; they may begin inside or outside."""
+    travelled = np.zeros(len(points), np.float32)
+    rays, total, crossings = np.arange(len(points)), np.zeros(len(points), np.float32), np.zeros(len(points), int)
+    for k in range(_CROSSINGS):
+        start = travelled[rays] + _BEYOND
+        hits = tracer.nearest(points[rays] + start[:, None] * directions[rays], directions[rays])
+        on = hits.geometry >= 0
+        rays = rays[on]
+        travelled[rays] = (start + hits.distance)[on]
+        # Summed with alternating signs; the last crossing leads out of the liquid, so it counts as positive.
+        total[rays] += np.float32((-1) ** k) * travelled[rays]
+        crossings[rays] += 1
+    return np.where(crossings % 2 == 1, total, -total)
 
 
 def openness(tracer: Tracer, points: Vectors) -> NDArray[np.float32]:

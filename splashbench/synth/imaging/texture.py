@@ -62,6 +62,26 @@ def printed(rng: np.random.Generator, size: tuple[int, int], base: Color) -> Alb
     return sheet
 
 
+def banded(rng: np.random.Generator, size: tuple[int, int], base: Color, ink: Color) -> Albedo:
+    """Glazed clay [height, width, 3] painted with bands and rows of leaves and dots; its left and right edges meet."""
+    import cv2
+
+    height, width = size
+    half = mottled(rng, (height, width // 2), base, 0.05)
+    clay = np.ascontiguousarray(np.concatenate([half, half[:, ::-1]], axis=1))
+    for row, thick in ((0.30, 0.006), (0.33, 0.014), (0.60, 0.008), (0.86, 0.012), (0.93, 0.006)):
+        cv2.line(clay, (0, int(row * height)), (width, int(row * height)), ink, max(1, int(thick * height)))
+    for row, count, long, wide in ((0.16, 10, 0.09, 0.030), (0.465, 24, 0.085, 0.014), (0.73, 36, 0.02, 0.008)):
+        for k in range(count):
+            # Painted by hand: no two strokes are quite alike.
+            angle = float((-1) ** k * 35 + rng.normal(0, 7))
+            centre = (int((k + 0.5 + rng.normal(0, 0.05)) * width / count), int((row + rng.normal(0, 0.004)) * height))
+            axes = (max(1, int(long * height * rng.uniform(0.85, 1.1))), max(1, int(wide * width / 3)))
+            shade = tuple(float(value) for value in np.array(ink) * rng.uniform(0.8, 1.5))
+            cv2.ellipse(clay, centre, axes, angle, 0, 360, shade, -1, cv2.LINE_AA)
+    return clay
+
+
 def charuco_board(board: dict[str, Any]) -> Any:
     """OpenCV's board object for the `[board]` table of session.toml."""
     import cv2
