@@ -3,8 +3,7 @@
 A Gaussian that shows for a moment is seen in few steps, and where it is faint its gradient is small. So the mean of its
 screen gradient is taken with the weights w = fading sigma (Cho et al. 2024, "dynamic-aware anchor growing"). w adds up
 to the same for a short and a long life. Children count once they have enough of it. A cell is one frame long; its
-size in space and the thresholds are those of static anchors (scaffold_gs/growth.py), but the finer a level, the more
-of its candidates are kept.
+size in space, the thresholds and the share of candidates kept are those of static anchors (scaffold_gs/cells.py).
 """
 
 from __future__ import annotations
@@ -18,13 +17,11 @@ from splashbench.gaussians.dynamic_model import Splats
 from splashbench.gaussians.screen_gradients import screen_gradients
 from splashbench.scene import Camera
 
-from ..scaffold_gs.cells import GrowthLevel
+from ..scaffold_gs.cells import LEVELS
 from ..scaffold_gs.growth import AnchorGrowth, GrowthRules
 from ..scaffold_gs.optimizer import AnchorOptimizer
 from .model import AnchorSplats
 from .settings import Scaffold4DSettings
-
-LEVELS = (GrowthLevel(16.0, 1.0, 0.5), GrowthLevel(4.0, 2.0, 0.75), GrowthLevel(1.0, 4.0, 0.875))
 
 
 class SpacetimeGrowth(AnchorGrowth):
@@ -40,16 +37,16 @@ class SpacetimeGrowth(AnchorGrowth):
         rng: np.random.Generator,
     ) -> None:
         views = settings.grow_every * settings.views_per_step
-        rules = GrowthRules(views, settings.grow_gradient, settings.prune_opacity, settings.max_anchors)
-        super().__init__(optimizer, np.array([voxel, voxel, voxel, frame]), LEVELS, rules, rng, np.float32)
-        self._from, self._until, self._every = (
-            round(settings.grow_from * settings.iterations),
-            round(settings.grow_until * settings.iterations),
-            settings.grow_every,
+        rules = GrowthRules(
+            views, settings.grow_gradient, settings.prune_opacity, settings.max_anchors, settings.spread_start
         )
+        super().__init__(optimizer, np.array([voxel, voxel, voxel, frame]), LEVELS, rules, rng, np.float32)
+        shares = (settings.count_from, settings.grow_from, settings.grow_until)
+        self._count, self._from, self._until = (round(share * settings.iterations) for share in shares)
+        self._every = settings.grow_every
 
     def wants_gradients(self, step: int) -> bool:
-        return self._from <= step < self._until
+        return min(self._count, self._from) <= step < self._until
 
     def observe(self, camera: Camera, splats: Splats, gradients: Tensor) -> None:
         assert isinstance(splats, AnchorSplats)

@@ -37,7 +37,7 @@ class Scaffold4D(Method):
 
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
-    version: ClassVar[str] = "2"  # since short fits hold their rates and come to rest
+    version: ClassVar[str] = "3"  # since `paper` starts and penalises as published
     Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
     mixed: ClassVar[bool] = True
 
@@ -47,7 +47,15 @@ class Scaffold4D(Method):
             seconds, frame = float(scene.times[-1] - scene.times[0]) or 1.0, 1 / max(1, scene.n_frames - 1)
             fastest = config.fastest * camera_extent(scene) * seconds
             variant = SpacetimeAnchorSpec(config.children, config.beta, fastest, config.base_color)
-            model = SpacetimeAnchors.from_start(start, variant, config.start_opacity, config.duration * frame, times)
+            model = SpacetimeAnchors.from_start(
+                start,
+                variant,
+                config.start_opacity,
+                config.duration * frame,
+                times,
+                config.spread_start,
+                1.0 if config.volume_unit == "scene" else None,
+            )
             optimizer = AnchorOptimizer(model, rates(config), config.iterations)
             voxel = config.voxel * float(np.median(start.spacing))
             with run.stage("fit"):

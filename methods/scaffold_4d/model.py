@@ -31,7 +31,7 @@ from splashbench.gaussians.initialization import StartingPoints
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera
 
-from ..scaffold_gs.model import FEATURES, PER_ANCHOR, Anchors, head, random_offsets
+from ..scaffold_gs.model import FEATURES, PER_ANCHOR, Anchors, first_offsets, head
 
 #: Tables with a row per anchor.
 ROWS = ("positions", *PER_ANCHOR)
@@ -109,12 +109,20 @@ class SpacetimeAnchors(Anchors, DynamicModel):
 
     @classmethod
     def from_start(
-        cls, start: StartingPoints, variant: SpacetimeAnchorSpec, opacity: float, duration: float, times: np.ndarray
+        cls,
+        start: StartingPoints,
+        variant: SpacetimeAnchorSpec,
+        opacity: float,
+        duration: float,
+        times: np.ndarray,
+        spread: bool = True,
+        unit: float | None = None,
     ) -> SpacetimeAnchors:
         """A model about to be fitted; random numbers come from torch's generator.
 
         duration: how long what comes from the hull shows, recordings. times: [frames] in [0, 1]. Static points last
-        all the recording long.
+        all the recording long. spread: features start at random and children apart, else both at zero as published.
+        unit: of length, scene units, in which volumes are penalised; None for the points' median spacing.
         """
         model = cls(len(start), variant)
         k, static = variant.children, torch.from_numpy(start.frame < 0)
@@ -123,11 +131,12 @@ class SpacetimeAnchors(Anchors, DynamicModel):
         with torch.no_grad():
             model.positions[:, :3] = torch.from_numpy(start.positions)
             model.positions[:, 3] = torch.where(static, 0.5, point_times)
-            model.unit.fill_(float(np.median(start.spacing)))
-            model.features.normal_(std=0.1)
+            model.unit.fill_(float(np.median(start.spacing)) if unit is None else unit)
+            if spread:
+                model.features.normal_(std=0.1)
             if variant.base_color:
                 model.features[:, :3] = torch.logit(torch.from_numpy(start.colors).clamp(0.02, 0.98))
-            model.offsets.copy_(random_offsets(len(start), k, 4))
+            model.offsets.copy_(first_offsets(len(start), k, 4, spread))
             model.log_scales.copy_(torch.from_numpy(start.spacing).log()[:, None].expand(-1, 8))
             step = 1 / max(1, len(times) - 1)
             model.log_scales[:, 3] = torch.where(static, math.log(0.5), math.log(step / 2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -22,6 +22,10 @@ class Scaffold4DSettings(DynamicFitSettings):
         base_color: a base colour per anchor, which the colour head corrects; 4D-Scaffold-GS has none.
         voxel: finest cell in which anchors grow, times the median spacing of the points at the start.
         prune_opacity: anchors whose children's mean opacities add up to less are dropped.
+        count_from: share of the steps after which the pulls and opacities are counted that growth goes by; at the
+            latest after `grow_from`.
+        spread_start: features start at random and children spread over their anchor's cell, else both at zero.
+        volume_unit: the unit of length in which volumes are penalised, the points' median "spacing" or the "scene"'s.
     """
 
     renamed: ClassVar[Mapping[str, str]] = {"most": "max_anchors"}
@@ -34,7 +38,9 @@ class Scaffold4DSettings(DynamicFitSettings):
         "paper": {
             "iterations": 120_000, "views_per_step": 1, "static": "points", "static_points": 100_000,
             "hull_points": 100_000, "children": 10, "max_anchors": 500_000, "fastest": 1.0, "base_color": False,
-            "grow_from": 0.0125, "grow_until": 0.5, "rates": "published", "longest_side": 16384,
+            # Published in steps: counted from 500, rounds after 1 500 and before 60 000.
+            "count_from": 1 / 240, "grow_from": 0.0125, "grow_until": 0.49999, "rates": "published",
+            "spread_start": False, "volume_unit": "scene", "longest_side": 16384,
         },
     }  # fmt: skip
 
@@ -46,6 +52,9 @@ class Scaffold4DSettings(DynamicFitSettings):
     base_color: bool = True
     voxel: float = Field(default=1.0, gt=0, le=100)
     prune_opacity: float = Field(default=0.005, ge=0, lt=1)
+    count_from: float = Field(default=1.0, ge=0, le=1)
+    spread_start: bool = True
+    volume_unit: Literal["spacing", "scene"] = "spacing"
     # Without growth by default, unlike other baselines.
     hull_points: int = Field(default=10_000, ge=0, le=5_000_000)
     grow_from: float = Field(default=0.0, ge=0, le=1)

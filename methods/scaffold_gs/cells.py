@@ -1,7 +1,8 @@
 """Which cells become anchors (Lu et al. 2024, Sec. 3.3), in space or in space-time.
 
 A cell becomes an anchor where a Gaussian within it is pulled at by more than a threshold and there is no anchor yet,
-level by level: coarse cells first, finer ones for stronger pulls. A random share of the candidates is left out.
+level by level: coarse cells first, finer ones for stronger pulls. A random share of the candidates is left out, a
+smaller one at finer levels.
 """
 
 from __future__ import annotations
@@ -22,6 +23,11 @@ class GrowthLevel:
     size: float
     factor: float
     kept: float
+
+
+#: As published: level m = 0, 1, 2 has cells of 16, 4, 1 times the finest and 2^m times the threshold, and keeps each
+#: candidate with the probability 1 - 2^-(m + 1). The paper leaves this share open; it is the official code's.
+LEVELS = (GrowthLevel(16.0, 1.0, 0.5), GrowthLevel(4.0, 2.0, 0.75), GrowthLevel(1.0, 4.0, 0.875))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Fits the anchors to the plates by gradient descent, then drops what no plate vouches for.
 
-Loss .8 L1 + .2 (1 - SSIM) + .01 mean(prod scale), as in Scaffold-GS, over seen pixels. Where the settings ask for it,
+Loss .8 L1 + .2 (1 - SSIM) + .01 mean(prod scale) over seen pixels, as in Scaffold-GS; scales are in scene units there,
+which `volume_unit` can replace by the anchors' spacing. Where the settings ask for it,
 the first steps see smaller images (a step's cost is mostly that of its pixels), and anchors grow (growth.py).
 """
 
@@ -88,11 +89,12 @@ def fit_model(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(random_seed)
         variant = StaticAnchorSpec(settings.children, settings.view_dependent_shape, settings.base_color)
-        model = AnchorModel.from_seed(seed, variant)
-        optimizer = AnchorOptimizer(model, settings.rates, settings.iterations)
+        model = AnchorModel.from_seed(seed, variant, settings.spread_start)
+        optimizer = AnchorOptimizer(model, settings.rates, settings.iterations, settings.rates_until)
         growth = Growth(optimizer, seed.voxel, settings, rng)
-        grow_from, grow_until = (round(f * settings.iterations) for f in (settings.grow_from, settings.grow_until))
-        unit = float(np.median(seed.spacing))
+        shares = (settings.count_from, settings.grow_from, settings.grow_until)
+        count_from, grow_from, grow_until = (round(share * settings.iterations) for share in shares)
+        unit = float(np.median(seed.spacing)) if settings.volume_unit == "spacing" else 1.0
         behind = torch.as_tensor(far_color)
         longest = max(max(plate.camera.width, plate.camera.height) for plate in plates)
         sizes = pyramid(longest, settings.coarse_side, settings.iterations)
@@ -115,14 +117,14 @@ def fit_model(
                     f"the background's loss is {float(loss.detach())} at iteration {iteration + 1}; see that the "
                     "scene's images and cameras are right, or give another seed"
                 )
-            growing = grow_from <= iteration < grow_until
-            if growing:
+            counting = min(count_from, grow_from) <= iteration < grow_until
+            if counting:
                 means.retain_grad()
             loss.backward()
             optimizer.step()
-            if growing:
+            if counting:
                 growth.observe(plate.camera, gaussians)
-                if (iteration + 1 - grow_from) % settings.grow_every == 0:
+                if iteration >= grow_from and (iteration + 1 - grow_from) % settings.grow_every == 0:
                     growth.round()
             if iteration % 10 == 0:
                 progress(iteration / settings.iterations)

@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from splashbench.gaussians.screen_gradients import screen_gradients
 from splashbench.scene import Camera
 
-from .cells import GrowthLevel, NewCells, new_cells
-from .model import AnchorModel, Anchors, DecodedGaussians, random_offsets
+from .cells import LEVELS, GrowthLevel, NewCells, new_cells
+from .model import AnchorModel, Anchors, DecodedGaussians, first_offsets
 from .optimizer import AnchorOptimizer
 from .settings import BackgroundSettings
 
-# The paper leaves the share that is kept open.
-LEVELS = (GrowthLevel(16.0, 1.0, 0.5), GrowthLevel(4.0, 2.0, 0.5), GrowthLevel(1.0, 4.0, 0.5))
 # Visits before a mean counts, as shares of the views between two rounds.
 _GROW_VISITS, _PRUNE_VISITS = 0.4, 0.8
 
@@ -36,13 +34,14 @@ class GrowthRules:
     """What makes an anchor come or go.
 
     views: rendered between two rounds. gradient: tau_g. opacity: an anchor whose children's mean opacities add up to
-    less goes. max_anchors: anchors at most.
+    less goes. max_anchors: anchors at most. spread: whether the children of a new anchor start spread over its cell.
     """
 
     views: int
     gradient: float
     opacity: float
     max_anchors: int
+    spread: bool = True
 
 
 class AnchorGrowth(ABC):
@@ -93,7 +92,7 @@ class AnchorGrowth(ABC):
         n, parents = len(cells.centers), torch.from_numpy(cells.chosen // k)
         new = {
             "features": self.anchors.features.detach()[parents],
-            "offsets": random_offsets(n, k, dimensions),
+            "offsets": first_offsets(n, k, dimensions, self.rules.spread),
             "log_scales": self._log_scales(parents, cells.sizes),
         }
         self.optimizer.replace_anchors(remaining, torch.from_numpy(cells.centers.astype(np.float32)), new)
@@ -136,7 +135,13 @@ class Growth(AnchorGrowth):
     def __init__(
         self, optimizer: AnchorOptimizer, voxel: float, settings: BackgroundSettings, rng: np.random.Generator
     ) -> None:
-        rules = GrowthRules(settings.grow_every, settings.grow_gradient, settings.prune_opacity, settings.max_anchors)
+        rules = GrowthRules(
+            settings.grow_every,
+            settings.grow_gradient,
+            settings.prune_opacity,
+            settings.max_anchors,
+            settings.spread_start,
+        )
         super().__init__(optimizer, np.full(3, voxel), LEVELS, rules, rng)
         self.voxel = voxel
 

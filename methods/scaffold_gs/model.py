@@ -87,16 +87,20 @@ class AnchorModel(Anchors):
         self.color_head = head(FEATURES + 3, 3 * variant.children)
 
     @classmethod
-    def from_seed(cls, seed: AnchorSeed, variant: StaticAnchorSpec) -> AnchorModel:
-        """A model about to be fitted; random numbers come from torch's generator."""
+    def from_seed(cls, seed: AnchorSeed, variant: StaticAnchorSpec, spread: bool = True) -> AnchorModel:
+        """A model about to be fitted; random numbers come from torch's generator.
+
+        With `spread` features start at random and children apart, else both at zero as published.
+        """
         model = cls(len(seed.positions), variant)
         spacing = torch.as_tensor(seed.spacing)
         with torch.no_grad():
             model.positions.copy_(torch.as_tensor(seed.positions))
-            model.features.normal_(std=0.1)
+            if spread:
+                model.features.normal_(std=0.1)
             if variant.base_color:
                 model.features[:, :3] = torch.logit(torch.as_tensor(seed.colors).clamp(0.02, 0.98))
-            model.offsets.copy_(random_offsets(len(model), variant.children))
+            model.offsets.copy_(first_offsets(len(model), variant.children, 3, spread))
             model.log_scales.copy_(spacing.log()[:, None].expand(-1, 6))
             last = {name: getattr(model, name)[-1] for name in ("opacity_head", "shape_head", "color_head")}
             for layer in last.values():
@@ -132,8 +136,10 @@ class AnchorModel(Anchors):
         return DecodedGaussians(means.view(rows, 3), factors, opacity, torch.sigmoid(logits).view(rows, 3), scales)
 
 
-def random_offsets(n: int, children: int, dimensions: int = 3) -> torch.Tensor:
-    """Offsets [n, children, dimensions] of new anchors, from torch's generator; within the anchor's cell."""
+def first_offsets(n: int, children: int, dimensions: int, spread: bool) -> torch.Tensor:
+    """Offsets [n, children, dimensions] of new anchors: random within the anchor's cell where `spread`, else zero."""
+    if not spread:
+        return torch.zeros(n, children, dimensions)
     return torch.rand(n, children, dimensions) * 1.4 - 0.7
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -35,14 +36,21 @@ RATES: dict[str, dict[str, LearningRate]] = {
 
 
 class AnchorOptimizer(RowOptimizer):
-    """Updates `model`; the learning rates go from their first to their last value over `iterations` steps."""
+    """Updates `model`; learning rates fall to their last value over `iterations` steps, times `until` where given."""
 
     model: Anchors
 
     def __init__(
-        self, model: Anchors, rates: Literal["short", "published"] | Mapping[str, LearningRate], iterations: int
+        self,
+        model: Anchors,
+        rates: Literal["short", "published"] | Mapping[str, LearningRate],
+        iterations: int,
+        until: float | None = None,
     ) -> None:
-        super().__init__(model, RATES[rates] if isinstance(rates, str) else rates, PER_ANCHOR, iterations)
+        chosen = RATES[rates] if isinstance(rates, str) else rates
+        if until is not None:
+            chosen = {name: replace(rate, until=until) for name, rate in chosen.items()}
+        super().__init__(model, chosen, PER_ANCHOR, iterations)
 
     def replace_anchors(self, kept: NDArray[np.int64], positions: torch.Tensor, new: dict[str, torch.Tensor]) -> None:
         """Keep the anchors `kept` and append new ones, at `positions` [n, D] and with rows of each of PER_ANCHOR.

@@ -31,8 +31,14 @@ class BackgroundSettings(MethodConfig):
         view_dependent_shape: also give the view direction to the opacity and covariance heads, as Scaffold-GS does.
         base_color: a base colour per anchor, which the colour head corrects; Scaffold-GS has none.
         rates: learning rates as "published", or larger ones for "short" fits.
+        rates_until: share of the iterations at which the learning rates have fallen to their last value; above 1 where
+            the fit ends before.
+        spread_start: features start at random and children spread over their anchor's cell, else both at zero.
+        volume_unit: the unit of length in which volumes are penalised, the anchors' median "spacing" or the "scene"'s.
         grow_from, grow_until: share of the iterations after which anchors are first added and pruned, and no longer
             are; equal for never.
+        count_from: share of the iterations after which the pulls and opacities are counted that growth goes by; at the
+            latest after `grow_from`.
         grow_every: steps between two rounds of growth.
         grow_gradient: mean gradient of the 2-D means (normalised device coordinates) above which a voxel gets an
             anchor, tau_g of Scaffold-GS at its coarsest level.
@@ -45,7 +51,10 @@ class BackgroundSettings(MethodConfig):
         "paper": {
             "frames": "first", "start": "points", "iterations": 20_000, "max_anchors": 100_000, "children": 10,
             "longest_side": 16384, "coarse_side": 16384, "ssim_every": 1, "view_dependent_shape": True,
-            "base_color": False, "rates": "published", "grow_from": 0.075, "grow_until": 0.5,
+            "base_color": False, "rates": "published", "rates_until": 1.5, "spread_start": False,
+            "volume_unit": "scene",
+            # Published in steps: counted from 500, rounds after 1 500 and before 15 000, rates until 30 000.
+            "count_from": 0.025, "grow_from": 0.075, "grow_until": 0.74995,
         },
         "quick": {"iterations": 400, "max_anchors": 5_000, "longest_side": 400},
     }  # fmt: skip
@@ -61,6 +70,10 @@ class BackgroundSettings(MethodConfig):
     view_dependent_shape: bool = False
     base_color: bool = True
     rates: Literal["short", "published"] = "short"
+    rates_until: float = Field(default=1.0, gt=0, le=1000)
+    spread_start: bool = True
+    volume_unit: Literal["spacing", "scene"] = "spacing"
+    count_from: float = Field(default=1.0, ge=0, le=1)
     grow_from: float = Field(default=0.0, ge=0, le=1)
     grow_until: float = Field(default=0.0, ge=0, le=1)
     grow_every: int = Field(default=100, ge=1, le=100_000)

@@ -190,7 +190,7 @@ def test_presets_are_the_papers_and_ours():
     assert isinstance(paper, BackgroundSettings)
     assert (paper.frames, paper.start, paper.iterations, paper.children) == ("first", "points", 20_000, 10)
     assert paper.grow_from * paper.iterations == 1500
-    assert paper.grow_until * paper.iterations == 10_000
+    assert round(paper.grow_until * paper.iterations) == 14_999
     assert (paper.grow_every, paper.grow_gradient, paper.prune_opacity) == (100, 2e-4, 0.005)
     for ours in (best, quick):
         assert isinstance(ours, BackgroundSettings)
