@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -18,6 +18,8 @@ from splashbench.scene.scene import TrainingScene
 
 from .appearance.decoder import Children
 from .appearance.fitting import composite
+from .carriers.between import carriers_at
+from .carriers.subframe import CarrierState
 from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
 from .reconstruction import fit_liquid
@@ -49,12 +51,20 @@ class FittedSplashSplat(Fitted):
     @torch.no_grad()
     def children(self, camera: Camera, time: float) -> Children | None:
         """The Gaussians of the liquid as `camera` sees them at `time` (seconds); None where there is no liquid."""
-        ids, state = self.liquid.track.at(self.liquid.times, time)
-        if len(ids) == 0:
-            return None
+        shown = [
+            self._decoded(camera, ids, state)
+            for ids, state in carriers_at(self.liquid.track, self.liquid.times, time)
+            if len(ids)
+        ]
+        if len(shown) < 2:
+            return shown[0] if shown else None
+        return Children(*(torch.cat([getattr(children, f.name) for children in shown]) for f in fields(Children)))
+
+    def _decoded(self, camera: Camera, ids: torch.Tensor, state: CarrierState) -> Children:
         if self.occlusion is not None:
             behind = torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
-            state = replace(state, visibility=1 - behind.to(torch.float32))
+            seen = 1 - behind.to(torch.float32)
+            state = replace(state, visibility=seen if state.visibility is None else seen * state.visibility)
         look = self.liquid.appearance
         eye = torch.tensor(camera.center, dtype=torch.float32)
         with one_torch_thread():
@@ -63,7 +73,7 @@ class FittedSplashSplat(Fitted):
 
     @torch.no_grad()
     def render(self, camera: Camera, time: float) -> Render:
-        """The view of `camera` at `time` (seconds), any time: between frames the carriers are advected."""
+        """The view of `camera` at `time` (seconds), any time; between frames see carriers/between.py."""
         background = torch.from_numpy(self._background(camera))
         children = self.children(camera, time)
         if children is None:

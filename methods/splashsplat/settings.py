@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "3"
+VERSION = "4"
 
 
 class SplashSplatConfig(MethodConfig):

@@ -1,9 +1,9 @@
-"""The liquid at any time (paper, supplement, "Sub-frame decoding").
+"""One frame's carriers at any time (paper, supplement, "Sub-frame decoding").
 
-Between two frames the carriers of the nearer one are advected by the fraction of the step, forwards or backwards, with
-the step's u_t, without correction or resampling, and phi is interpolated linearly between the two observations. What
-was learned stays as it is. (The paper goes forwards only; from the nearer frame the way is at most half a step, and a
-photograph taken a little before its frame's time is explained by that frame's own carriers.)
+Between two frames carriers are advected by the fraction of the step, forwards or backwards, with the step's u_t,
+without correction or resampling, and phi is interpolated linearly between the two observations. What was learned stays
+as it is. (The paper goes forwards only; a photograph taken a little before its frame's time is explained by that
+frame's own carriers.) How the carriers of two frames show what is between them: between.py.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class CarrierState:
     """What the decoder needs of n active carriers at one instant.
 
     positions: [n, 3] scene units. deformation: [n, 3, 3], F. phi: [n] transport voxels. visibility: [n] in [0, 1], by
-    which opacities are multiplied where the carriers are hidden from the view at hand; all are seen by default.
+    which opacities are multiplied: less than 1 of carriers that are hidden from the view at hand, or whose frame is not
+    the instant's; all are seen by default.
     """
 
     positions: Tensor
@@ -74,18 +75,19 @@ class Track:
 
     def state(self, t: int, fraction: float = 0.0) -> CarrierState:
         """Decoder input of frame `t`'s carriers, a `fraction` in (-1, 1) of a step after the frame; see `locate`."""
-        rows = self.carriers.rows(t)
-        positions, deformation = self.carriers.positions[rows], self.carriers.deformation[rows]
-        phi = self.carriers.phi[rows]
+        positions, deformation = self.moved(t, fraction)
+        phi = self.carriers.phi[self.carriers.rows(t)]
         if fraction != 0 and len(positions):
-            step, other = (t, t + 1) if fraction > 0 else (t - 1, t - 1)
-            positions, deformation = self.motion.step(step).forecast(positions, deformation, fraction)
+            other = t + 1 if fraction > 0 else t - 1
             nearer, farther = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
             phi = ((1 - abs(fraction)) * nearer + abs(fraction) * farther).astype(np.float32)
         scene_positions = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))
         return CarrierState(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
 
-    def at(self, times: np.ndarray, time: float) -> tuple[Tensor, CarrierState]:
-        """Carriers at `time` (seconds), the frames being at `times` [T]: their numbers and the decoder's input."""
-        t, fraction = locate(times, time)
-        return self.ids(t), self.state(t, fraction)
+    def moved(self, t: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+        """Where frame `t`'s carriers are (transport grid), and their F, a `fraction` of a step after the frame."""
+        rows = self.carriers.rows(t)
+        positions, deformation = self.carriers.positions[rows], self.carriers.deformation[rows]
+        if fraction == 0 or len(positions) == 0:
+            return positions, deformation
+        return self.motion.step(t if fraction > 0 else t - 1).forecast(positions, deformation, fraction)

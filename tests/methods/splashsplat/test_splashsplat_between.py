@@ -1,0 +1,116 @@
+"""The liquid between two frames: a column, a drop and a front whose motion is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.observe.grid import Grid
+from splashbench.scene.geometry import STEPS_PER_VOXEL
+from splashbench_methods.splashsplat.carriers.between import carriers_at, steadiness
+from splashbench_methods.splashsplat.carriers.population import Carriers
+from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.motion.steps import Motion
+
+SHAPE = (24, 24, 64)
+TIMES = np.array([1.0, 1.2])
+NODES = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float64) for n in SHAPE), indexing="ij"), axis=-1)
+
+
+def column(low: float, high: float, radius: float = 4.0) -> np.ndarray:
+    """Signed distance, nearly, of an upright column about the grid's middle: voxels."""
+    side = np.linalg.norm(NODES[..., :2] - 12, axis=-1) - radius
+    return np.maximum(side, np.maximum(low - NODES[..., 2], NODES[..., 2] - high))
+
+
+def ball(height: float, radius: float = 3.0) -> np.ndarray:
+    return np.linalg.norm(NODES - np.array([12, 12, height]), axis=-1) - radius
+
+
+def track_of(before: np.ndarray, after: np.ndarray, fall: float) -> Track:
+    """Carriers all through both frames' liquid, which falls by `fall` voxels from frame to frame."""
+    positions = [np.argwhere(phi <= 0).astype(np.float32) + np.float32(0.3) for phi in (before, after)]
+    starts = np.cumsum([0, *map(len, positions)])
+    everywhere = np.concatenate(positions)
+    phi = np.concatenate([field[field <= 0] for field in (before, after)]).astype(np.float32)
+    F = np.tile(np.eye(3, dtype=np.float32), (len(everywhere), 1, 1))
+    carriers = Carriers(starts, np.arange(len(everywhere), dtype=np.int32), everywhere, F, phi, len(everywhere))
+    velocities = np.zeros((1, 8, 8, 18, 3), dtype=np.float16)
+    velocities[..., 2] = -fall
+    packed = np.clip(np.stack([before, after]) * STEPS_PER_VOXEL, -127, 127).astype(np.int8)
+    return Track(Grid(np.zeros(3), 1.0, SHAPE), carriers, Motion(velocities, 4, [None]), packed)
+
+
+def opacity_by_height(track: Track, fraction: float) -> np.ndarray:
+    """Sum over the carriers of each slab of two voxels, of what their opacities are multiplied by: [32]."""
+    total = np.zeros(SHAPE[2] // 2)
+    for _, state in carriers_at(track, TIMES, TIMES[0] + fraction * (TIMES[1] - TIMES[0])):
+        weight = torch.ones(len(state.phi)) if state.visibility is None else state.visibility
+        slab = np.clip(state.positions[:, 2].numpy() / 2, 0, len(total) - 1).astype(int)
+        np.add.at(total, slab, (weight * torch.sigmoid(2 * (3 - state.phi.abs()))).numpy())
+    return total
+
+
+@pytest.mark.parametrize("fraction", [0.2, 0.5, 0.8])
+def test_a_jet_that_flows_on_stays_full_and_gets_no_longer(fraction: float):
+    jet = column(8, 56)
+    track = track_of(jet, jet, fall=7)
+    at_frame, between = opacity_by_height(track, 0), opacity_by_height(track, fraction)
+    full = at_frame > 0.5 * at_frame.max()
+    assert between[full] == pytest.approx(at_frame[full], rel=0.35)
+    assert between[~full].sum() < 0.05 * at_frame.sum()
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.5, 0.9])
+def test_a_drop_that_moves_by_more_than_its_size_is_where_it_flies_and_as_opaque(fraction: float):
+    track = track_of(ball(46), ball(26), fall=20)
+    at_frame = opacity_by_height(track, 0)
+    parts = carriers_at(track, TIMES, TIMES[0] + fraction * (TIMES[1] - TIMES[0]))
+    heights = torch.cat([state.positions[:, 2] for _, state in parts])
+    weights = torch.cat([state.visibility for _, state in parts])
+    assert float((heights * weights).sum() / weights.sum()) == pytest.approx(46.3 - 20 * fraction, abs=0.5)
+    assert opacity_by_height(track, fraction).sum() == pytest.approx(at_frame.sum(), rel=0.1)
+
+
+def test_what_gets_to_where_no_liquid_is_fades_on_the_way():
+    track = track_of(ball(46), ball(46), fall=20)  # the motion is wrong: the ball rests
+    (_, moved), *_ = carriers_at(track, TIMES, TIMES[0] + 0.6 * (TIMES[1] - TIMES[0]))
+    assert float(moved.visibility.max()) < 0.5 * (1 - 0.6)
+
+
+def test_nothing_jumps_half_way_nor_at_a_frame():
+    track = track_of(column(20, 56), column(10, 56), fall=10)
+    step = TIMES[1] - TIMES[0]
+    (_, here), *_ = carriers_at(track, TIMES, TIMES[0] + 0.4999 * step)
+    (_, there), *_ = carriers_at(track, TIMES, TIMES[0] + 0.5001 * step)
+    assert float((here.positions - there.positions).norm(dim=1).max()) < 0.01
+    assert float((here.visibility - there.visibility).abs().max()) < 0.001
+    for frame, fraction in ((0, 0.001), (1, 0.999)):
+        at_frame = opacity_by_height(track, frame)
+        assert np.abs(opacity_by_height(track, fraction) - at_frame).max() < 0.05 * at_frame.max()
+
+
+def test_at_a_frames_time_the_frames_own_carriers_are_shown():
+    track = track_of(ball(46), ball(26), fall=20)
+    for t, time in ((0, TIMES[0]), (1, TIMES[1]), (0, 0.0), (1, 9.0)):
+        ((ids, state),) = carriers_at(track, TIMES, time)
+        assert torch.equal(ids, track.ids(t))
+        assert torch.equal(state.positions, track.state(t).positions)
+        assert state.visibility is None
+
+
+def test_a_frame_without_liquid_fades_into_the_next_one():
+    track = track_of(np.full(SHAPE, 9.0), ball(26), fall=0)
+    for fraction in (0.25, 0.75):
+        parts = carriers_at(track, TIMES, TIMES[0] + fraction * (TIMES[1] - TIMES[0]))
+        assert all(float(state.visibility.max()) <= fraction for ids, state in parts if len(ids))
+
+
+def test_steady_is_what_keeps_its_place():
+    rests, flies = (
+        steadiness(*(np.clip(phi * STEPS_PER_VOXEL, -127, 127).astype(np.int8) for phi in pair))
+        for pair in ((column(0, 40), column(0, 40)), (ball(46), ball(26)))
+    )
+    assert rests[12, 12, 20] == pytest.approx(1)
+    assert flies[12, 12, 46] == flies[12, 12, 26] == 0
