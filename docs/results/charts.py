@@ -172,7 +172,9 @@ def interpolation() -> Figure:
     figure = Figure(figsize=(9.2, 2.4), layout="constrained")
     first, second = figure.subplots(1, 2, sharey=True)
     first.plot([float(table[name, "psnr"]["mean"]) for name in names], range(len(names)), "o", color=BLUE)
-    first.set_title("PSNR at timesteps that were not seen, dB →")
+    faded = {y: table[f"{name}, faded", "psnr"] for y, name in enumerate(names) if (f"{name}, faded", "psnr") in table}
+    first.plot([float(row["mean"]) for row in faded.values()], list(faded), "|", color=GREY, ms=9, mew=1.5)
+    first.set_title("PSNR at timesteps that were not seen, dB →" + (" (bars: faded)" if faded else ""))
     named_rows(first, names)
     scene_dots(second, loss, names)
     second.set_title("← lost against a fit that saw every timestep, dB")

@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
     table = make_table(plan, Store(arguments.out))
     command = _command(arguments)
     files = write_report(table, arguments.out, command)
-    failed = sum(len(row.failed) for row in table.rows)
+    failed = len(table.failed)
     reused = f", {tally.reused} reused" if tally.reused else ""
     say(f"{tally.made} runs made{reused}; {len(table.rows)} rows, {failed} failed runs")
     for file in files:

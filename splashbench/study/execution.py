@@ -93,8 +93,10 @@ def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) ->
     result = store.result(entry)
     if result is None:
         return True
-    return (with_lpips and result.value("lpips") is None) or (
-        run.timing_frames > 0 and result.value("render_fps") is None
+    return (
+        (with_lpips and result.value("lpips") is None)
+        or (run.timing_frames > 0 and result.value("render_fps") is None)
+        or (run.variant.withheld is not None and store.faded(entry) is None)
     )
 
 

@@ -21,6 +21,7 @@ from splashbench.score import Result, score_submission, shared_fields
 from splashbench.study.scenes import changed_scene
 from splashbench.study.spec import StudyVariant
 from splashbench.submission import Record, Status, Submission
+from splashbench.submission.faded import FadedSubmission
 
 #: The status of a run that ended outside its method: in reading the scene, say, or in scoring.
 ERROR = "error"
@@ -54,6 +55,7 @@ class RunEntry(BaseModel):
 
     Attributes:
         result: name of its file in results/; null where there is none.
+        faded: where timesteps were withheld, that of the control `faded` (submission/faded.py).
         at_once: how many runs shared the machine.
         seconds: duration of the run, scoring included.
     """
@@ -65,6 +67,7 @@ class RunEntry(BaseModel):
     status: str
     reason: str = ""
     result: str | None = None
+    faded: str | None = None
     record: Record | None = None
     train_views: list[str] = Field(default_factory=list)
     at_once: int = 1
@@ -90,6 +93,11 @@ class Store:
     def result(self, entry: RunEntry) -> Result | None:
         """The result of an entry, None where it has none."""
         return Result.load(self.results / entry.result) if entry.result else None
+
+    def faded(self, entry: RunEntry) -> Result | None:
+        """The result of an entry's control `faded`, None where it has none."""
+        path = self.results / entry.faded if entry.faded else None
+        return Result.load(path) if path and path.is_file() else None
 
     def entry_path(self, digest: str) -> Path:
         return self.runs / f"{digest[:16]}.json"
@@ -125,8 +133,8 @@ def carry_out(job: Job) -> RunEntry:
     earlier = store.entry(job.digest)
     entry = entry.model_copy(update={"seconds": time.monotonic() - start})
     write_model(store.entry_path(job.digest), entry)
-    if earlier and earlier.result and earlier.result != entry.result:
-        (store.results / earlier.result).unlink(missing_ok=True)
+    for stale in {earlier.result, earlier.faded} - {entry.result, entry.faded, None} if earlier else ():
+        (store.results / str(stale)).unlink(missing_ok=True)
     return entry
 
 
@@ -156,7 +164,10 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     weights = Path(job.lpips_weights) if job.lpips_weights else None
     # Evaluation data never change: the fields come from the scene itself, not from worse masks or fewer views.
     result = score_submission(scene, submission, reference, weights, fields=shared_fields(original))
-    saved = result.save(store.results)
+    saved, faded = result.save(store.results), None
+    if job.variant.withheld and submission.status == Status.OK:
+        control = FadedSubmission(submission, scene)
+        faded = score_submission(scene, control, reference, weights, fields=shared_fields(original)).save(store.results)
     if not job.keep and not job.is_reference:
         shutil.rmtree(place)
     return entry.model_copy(
@@ -164,6 +175,7 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
             "status": result.status,
             "reason": result.reason,
             "result": saved.name,
+            "faded": faded.name if faded else None,
             "record": submission.record,
             "train_views": list(scene.train),
         }

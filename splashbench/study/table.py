@@ -20,6 +20,8 @@ from splashbench.study.spec import DERIVED, StudySpec, metric_of
 
 #: The status of a run that has not been made.
 NOT_RUN = "not run"
+#: Behind a variant's name, the row of its control `faded` (submission/faded.py). No variant has a comma in its name.
+FADED = ", faded"
 #: A metric's columns in table.csv: its name with each of these behind it.
 SUFFIXES = ("", "_std", "_difference", "_difference_std")
 #: Column of leaderboards/paper.csv for a metric, and what turns its unit into the metric's.
@@ -39,13 +41,23 @@ _PAPER_COLUMNS = {
 }
 
 
+_REFERENCE_NOTE = "control: the background alone"
+_FADED_NOTE = "control: the row's own renders of the timesteps before and after, averaged"
+
+
 @dataclass(frozen=True)
 class StudyRun:
-    """A run of the plan, with its entry and result where it has been made."""
+    """A run of the plan, with its entry and result where it has been made; `faded`: of the run's control instead."""
 
     planned: PlannedRun
     entry: RunEntry | None
     result: Result | None
+    faded: bool = False
+
+    @property
+    def row(self) -> str:
+        """The name of its row."""
+        return self.planned.variant.name + (FADED if self.faded else "")
 
     @property
     def status(self) -> str:
@@ -54,6 +66,10 @@ class StudyRun:
     @property
     def reason(self) -> str:
         return self.entry.reason if self.entry else ""
+
+    @property
+    def failed(self) -> bool:
+        return self.status not in ("ok", NOT_RUN)
 
     def value(self, metric: str) -> float | None:
         """The run's figure; None where it has none, and of runs that failed."""
@@ -84,7 +100,7 @@ class Cell:
 class TableRow:
     """A variant, or the reference: its runs and a cell for each metric. `paper`: what the paper reports of it.
 
-    control: whether it is of a method that is a control, as the reference is.
+    control: whether it is of a method that is a control, as the reference is, or a variant faded.
     """
 
     name: str
@@ -100,7 +116,7 @@ class TableRow:
 
     @property
     def failed(self) -> tuple[StudyRun, ...]:
-        return tuple(run for run in self.runs if run.status not in ("ok", NOT_RUN))
+        return tuple(run for run in self.runs if run.failed)
 
     @property
     def mixed(self) -> bool:
@@ -118,7 +134,7 @@ class Table:
     """A study's outcome.
 
     Attributes:
-        rows: variants in the spec's order, then the reference.
+        rows: variants in the spec's order, each with its control `faded` where it has one, then the reference.
         run_frame: a row per run, the columns of runs.csv.
         figures: indexed by row name; a column for each metric with each of SUFFIXES, NaN where there is no figure.
         scenes_of: the scenes that a metric is averaged over, by name.
@@ -138,7 +154,13 @@ class Table:
 
     @property
     def runs(self) -> tuple[StudyRun, ...]:
-        return tuple(run for row in self.rows for run in row.runs)
+        """Every run once: a control `faded` has none of its own."""
+        return tuple(run for row in self.rows for run in row.runs if not run.faded)
+
+    @property
+    def failed(self) -> tuple[StudyRun, ...]:
+        """The runs that failed."""
+        return tuple(run for run in self.runs if run.failed)
 
     @property
     def baseline(self) -> TableRow:
@@ -148,10 +170,17 @@ class Table:
 def make_table(plan: StudyPlan, store: Store) -> Table:
     """The table of what is in `store` by now."""
     spec = plan.spec
-    planned = {v.name: (v.note, [run for run in plan.runs if run.variant.name == v.name]) for v in spec.variants}
+    notes: dict[str, str] = {}
+    runs: dict[str, tuple[StudyRun, ...]] = {}
+    for variant in spec.variants:
+        planned = [run for run in plan.runs if run.variant.name == variant.name]
+        notes[variant.name], runs[variant.name] = variant.note, tuple(_study_run(run, store) for run in planned)
+        if variant.withheld:
+            name = variant.name + FADED
+            notes[name], runs[name] = _FADED_NOTE, tuple(_study_run(run, store, faded=True) for run in planned)
     if plan.reference_row:
-        planned[plan.reference_row[0].variant.name] = ("control: the background alone", list(plan.reference_row))
-    runs = {name: tuple(_study_run(run, store) for run in row) for name, (_, row) in planned.items()}
+        name = plan.reference_row[0].variant.name
+        notes[name], runs[name] = _REFERENCE_NOTE, tuple(_study_run(run, store) for run in plan.reference_row)
     run_frame = _run_frame([run for row in runs.values() for run in row], spec.metrics)
     scenes_of = {
         metric: tuple(s.name for s in plan.scenes if s.name in set(run_frame["scene"][run_frame[metric].notna()]))
@@ -164,19 +193,20 @@ def make_table(plan: StudyPlan, store: Store) -> Table:
         TableRow(
             name=name,
             note=note,
-            control=runs[name][0].planned.control,
+            control=runs[name][0].planned.control or runs[name][0].faded,
             runs=runs[name],
             cells={metric: _cell(metric, figures.loc[name], means.loc[name]) for metric in spec.metrics},
             paper=paper.get(name, {}),
         )
-        for name, (note, _) in planned.items()
+        for name, note in notes.items()
     ]
     return Table(plan, tuple(rows), run_frame, figures, scenes_of)
 
 
-def _study_run(planned: PlannedRun, store: Store) -> StudyRun:
+def _study_run(planned: PlannedRun, store: Store, faded: bool = False) -> StudyRun:
     entry = store.entry(planned.digest)
-    return StudyRun(planned, entry, store.result(entry) if entry else None)
+    read = store.faded if faded else store.result
+    return StudyRun(planned, entry, read(entry) if entry else None, faded)
 
 
 def _run_frame(runs: Sequence[StudyRun], metrics: Sequence[str]) -> pd.DataFrame:
@@ -184,7 +214,7 @@ def _run_frame(runs: Sequence[StudyRun], metrics: Sequence[str]) -> pd.DataFrame
     records = [run.entry.record if run.entry else None for run in runs]
     columns = {
         "scene": [run.planned.scene.name for run in runs],
-        "variant": [run.planned.variant.name for run in runs],
+        "variant": [run.row for run in runs],
         "seed": [run.planned.seed for run in runs],
         "status": [run.status for run in runs],
         "reason": [run.reason for run in runs],

@@ -43,9 +43,8 @@ def _scenes(table: Table) -> str:
 
 def _facts(table: Table) -> str:
     plan = table.plan
-    ok = sum(row.count("ok") for row in table.rows)
-    failed = sum(len(row.failed) for row in table.rows)
-    waiting = sum(row.count(NOT_RUN) for row in table.rows)
+    ok, waiting = (sum(run.status == status for run in table.runs) for status in ("ok", NOT_RUN))
+    failed = len(table.failed)
     budget = ", ".join(f"{key} = {value}" for key, value in plan.spec.base.items()) or "none"
     at_once = max((run.entry.at_once for run in table.runs if run.entry), default=1)
     shared = any(run.entry and run.entry.record and run.entry.record.reused for run in table.runs)
@@ -134,7 +133,7 @@ def _changes(table: Table, row: TableRow) -> dict[str, str]:
     """What a row changes: the cells of its line."""
     first = row.runs[0].planned
     variant = first.variant
-    settings = variant.settings if row.name in table.plan.spec.names else first.overrides
+    settings = variant.settings if variant.name in table.plan.spec.names else first.overrides
     method = f"{first.method} " if variant.method else ""
     scene = [f"{step.kind} {_amount(step.model_dump())}" for step in variant.perturbation]
     if variant.train_views is not None:
@@ -159,8 +158,7 @@ def _failures(table: Table) -> list[str]:
     lines = [
         f"{run.planned.variant.name}, seed {run.planned.seed}, {run.planned.scene.name}: {run.status}: "
         f"{one_line(run.reason)}"
-        for row in table.rows
-        for run in row.failed
+        for run in table.failed
     ]
     return ["## Failed runs", bullets(lines)] if lines else []
 

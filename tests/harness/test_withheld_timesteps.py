@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splashbench.cli.main import main
+from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.harness.runner import run_method
 from splashbench.harness.training_copy import make_training_copy
@@ -104,6 +105,39 @@ def test_the_withheld_ones_alone_are_scored(result: tuple[Path, Path], balls: Sc
     board = (tmp_path / "board" / "leaderboard.csv").read_text()
     assert "v1, odd timesteps withheld" in board
     assert len(board.splitlines()) == 3
+
+
+def test_faded_is_the_mean_of_the_renders_before_and_after(result: tuple[Path, Path], balls: Scene) -> None:
+    from splashbench.submission import Submission
+    from splashbench.submission.faded import FadedSubmission
+
+    odd, whole = (Submission.open(path) for path in result)
+    faded = FadedSubmission(odd, balls)
+    for t in range(balls.n_frames):
+        # What grows evenly with time is half way in between what it was and will be, by the clock.
+        here, own = (source.rendering(balls.test[0], t).astype(int) for source in (faded, odd))
+        assert np.abs(here - own).max() <= (1 if t in (1, 3, 5) else 0)
+        np.testing.assert_array_equal(faded.alpha(balls.test[0], t), odd.alpha(balls.test[0], t))
+    scored = score_submission(balls, faded)
+    assert (scored.method, scored.control, scored.withheld) == ("clock_faded", True, "odd")
+    assert scored.value("psnr") == pytest.approx(score_submission(balls, odd).value("psnr"), abs=0.1)
+    assert scored.value("fit_seconds") is None
+    with pytest.raises(SplashbenchError, match="no withheld timesteps"):
+        FadedSubmission(whole, balls)
+
+
+def test_faded_weighs_by_nearness_in_time(tmp_path: Path) -> None:
+    from splashbench.submission import Submission
+    from splashbench.submission.faded import FadedSubmission
+    from splashbench.synth.balls import write_balls_scene
+
+    write_balls_scene(tmp_path / "scene", n_frames=3, delays={"6": 0.05})
+    scene = Scene.open(tmp_path / "scene")
+    run_method(METHOD, scene.directory, tmp_path / "odd", timing_frames=0, withheld="odd")
+    faded = FadedSubmission(Submission.open(tmp_path / "odd"), scene)
+    for name in scene.test:
+        shown = faded.rendering(name, 1).astype(int)
+        assert np.abs(shown - round(255 * float(scene.camera_times[name][1]))).max() <= 1
 
 
 def test_two_timesteps_are_too_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

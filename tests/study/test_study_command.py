@@ -101,6 +101,45 @@ def test_results_are_a_leaderboard_s_and_renders_are_gone(study: tuple[str, Path
     assert list((out / "submissions").iterdir()) == []
 
 
+def test_every_row_with_withheld_timesteps_has_its_own_renders_faded_beside_it(
+    balls_directory: Path, tmp_path: Path
+) -> None:
+    log, out = tmp_path / "log", tmp_path / "out"
+    spec = _spec(
+        balls_directory,
+        seeds=[0],
+        base={"log": str(log)},
+        metrics=["psnr", "miou", "fit_seconds"],
+        variants=[
+            {"name": "full", "withheld": "odd"},
+            {"name": "hull", "method": "hull_points", "withheld": "odd"},
+            {"name": "seen"},
+        ],
+    )
+    path = _write(tmp_path, spec)
+    assert main(["study", "run", path, str(out)]) == 0
+    rows = {row["variant"]: row for row in _table(out)["rows"]}
+    assert list(rows) == ["full", "full, faded", "hull", "hull, faded", "seen"]
+    assert [row["control"] for row in rows.values()] == [False, True, False, True, False]
+    figures = {name: row["figures"] for name, row in rows.items()}
+    # A picture that never changes is its own mean. What moves is not.
+    assert figures["full, faded"]["psnr"]["mean"] == figures["full"]["psnr"]["mean"]
+    assert figures["hull, faded"]["psnr"]["mean"] != figures["hull"]["psnr"]["mean"]
+    assert figures["hull, faded"]["fit_seconds"]["mean"] is None
+    assert len(_fits(log)) == 2  # one for each setting of Grey: fading needs no fit
+    markdown = (out / "table.md").read_text()
+    assert "| *hull, faded* |" in markdown
+    assert "- Runs: 3 ok, 0 failed" in markdown
+    assert main(["study", "run", path, str(out)]) == 0
+    assert len(_fits(log)) == 2
+    # A study from before the control existed has its runs made again.
+    for entry in (out / "runs").glob("*.json"):
+        said = json.loads(entry.read_text())
+        entry.write_text(json.dumps({key: value for key, value in said.items() if key != "faded"}))
+    assert main(["study", "run", path, str(out)]) == 0
+    assert len(_fits(log)) == 3
+
+
 def test_a_shared_part_counts_in_every_fit_time(study: tuple[str, Path, Path]) -> None:
     path, out, _ = study
     plan, store = make_plan(load_spec(path)), Store(out)
