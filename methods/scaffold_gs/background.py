@@ -12,6 +12,7 @@ from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clea
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, read_npz
 from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
+from splashbench.gaussians.initialization import hull_points
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.render import rasterize_arrays
@@ -91,13 +92,18 @@ def fit_background(
     """Fit the static scene behind the liquid to the training views' plates. The same seed gives the same background.
 
     `span` is the part of `run`'s progress that this takes up, for callers with more to do. Raises SplashbenchError
-    where masks leave nothing to fit, or the anchors are to start from sparse points and there are none.
+    where masks leave nothing to fit, or the anchors are to start from points and there are none, nor a hull.
     """
+    fitting = "background"
 
     def progress(fraction: float, message: str) -> None:
         run.progress(span[0] + (span[1] - span[0]) * fraction, message)
 
-    points = _initial_points(scene, settings)
+    points = scene.initial_points()
+    if settings.start == "points" and (points is None or not len(points)):
+        fitting = "background, from points of the liquid's hull, as the scene has no sparse ones"
+        progress(0, fitting)
+        points = _hull_points(scene, settings.max_anchors)
     n_frames = 1 if settings.frames == "first" else MAX_FRAMES
     plates: list[CleanPlate] = []
     for i, name in enumerate(scene.train):
@@ -115,18 +121,23 @@ def fit_background(
     with one_torch_thread():
         model = fit_model(
             seed, plates, settings, far_color.astype(np.float32), run.seed,
-            lambda fraction: progress(0.1 + 0.9 * fraction, "background"),
+            lambda fraction: progress(0.1 + 0.9 * fraction, fitting),
         )  # fmt: skip
         return Background(supervised_anchors(model, plates), far_color)
 
 
-def _initial_points(scene: TrainingScene, settings: BackgroundSettings) -> NDArray[np.float32] | None:
-    """The scene's sparse points; None where there are none and none are needed."""
-    points = scene.initial_points()
-    if settings.start == "points" and (points is None or not len(points)):
+def _hull_points(scene: TrainingScene, count: int) -> NDArray[np.float32]:
+    """Some `count` points on the liquid's hull, all frames together: float32 [n, 6], positions and colours.
+
+    The paper starts there on synthetic scenes, which have no sparse points (supplement, "Baselines").
+    """
+    hull = hull_points(scene, count)
+    if not len(hull):
         path = scene.directory / "init_pt_cld.npz"
-        raise SplashbenchError(f"{path} holds no points to start from; add them, or set start=pixels")
-    return points
+        raise SplashbenchError(
+            f"{path} holds no points to start from, nor do the masks show liquid; add points, or set start=pixels"
+        )
+    return np.concatenate([hull.positions, hull.colors], axis=1)
 
 
 def _seed(

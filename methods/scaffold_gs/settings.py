@@ -21,7 +21,7 @@ class BackgroundSettings(MethodConfig):
         frames: what a view's plate is made of: the median over "all" frames in which a pixel is free of liquid, or the
             "first" frame alone.
         start: where the anchors start: "pixels" lifts every training pixel to its depth (plane sweep), "points" takes
-            the scene's sparse points, one anchor per voxel.
+            the scene's sparse points, one anchor per voxel, or points of the liquid's hull where there are none.
         iterations: optimisation steps, one training view each.
         max_anchors: at most this many anchors, grown ones included.
         children: Gaussians per anchor, k of Scaffold-GS.

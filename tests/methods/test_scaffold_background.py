@@ -174,15 +174,34 @@ def test_cameras_may_differ_in_size(balls: Scene):
         assert np.isfinite(background.render(balls.cameras[balls.test[0]])).all()
 
 
-def test_starting_from_sparse_points_needs_some(balls_copy: Path):
+def test_without_sparse_points_the_hull_is_started_from_and_the_user_is_told(balls_copy: Path):
     path = balls_copy / "init_pt_cld.npz"
     np.savez(path, data=np.empty((0, 7), np.float32))
-    with pytest.raises(SplashbenchError, match=r"init_pt_cld\.npz holds no points.*start=pixels"):
-        fit_background(Scene.open(balls_copy).training(), GROWING, Run(seed=0))
-    assert len(fit_background(Scene.open(balls_copy).training(), TINY, Run(seed=0)).model) > 0
+    scene = Scene.open(balls_copy)
+    heard: list[str] = []
+    run = Run(seed=0, _report=lambda fraction, message: heard.append(message))
+    empty = fit_background(scene.training(), GROWING, run).model
+    assert len(empty) > 0
+    assert "background, from points of the liquid's hull, as the scene has no sparse ones" in heard
+    # The balls fly above the floor, and nowhere else is there anything to start from.
+    truth = scene.truth_particles().positions.reshape(-1, 3)
+    size = np.ptp(truth, axis=0).max()
+    distance = np.abs(empty.positions.numpy()[:, None] - truth[None]).max(axis=2).min(axis=1)
+    assert np.median(distance) < 0.2 * size
     path.unlink()
+    absent = fit_background(scene.training(), GROWING, Run(seed=0)).model
+    np.testing.assert_array_equal(absent.positions.numpy(), empty.positions.numpy())
+
+
+def test_where_there_is_no_hull_either_sparse_points_are_asked_for(balls_copy: Path):
+    (balls_copy / "init_pt_cld.npz").unlink()
+    scene = Scene.open(balls_copy)
+    for name in scene.train:
+        for t in range(scene.n_frames):
+            _paint(scene.mask_path(name, t), np.zeros_like)
     with pytest.raises(SplashbenchError, match=r"init_pt_cld\.npz holds no points.*start=pixels"):
-        fit_background(Scene.open(balls_copy).training(), GROWING, Run(seed=0))
+        fit_background(scene.training(), GROWING, Run(seed=0))
+    assert len(fit_background(scene.training(), TINY, Run(seed=0)).model) > 0
 
 
 def test_presets_are_the_papers_and_ours():

@@ -9,6 +9,9 @@ import pytest
 
 from splashbench import toml
 from splashbench.cli.main import main
+from splashbench.harness.contract import Run
+from splashbench.scene import Scene
+from splashbench_methods.scaffold_gs import BackgroundSettings, fit_background
 
 FEW_STEPS = ["--set", "iterations=10", "--set", "max_anchors=200", "--set", "longest_side=32"]
 
@@ -101,6 +104,16 @@ def test_the_methods_of_table_s4_are_fitted_scored_and_stand_beside_it(
     for method, figures in zip(methods, ("31.93 | 0.9355", "31.89 | 0.9325", "28.13 | 0.8633", "31.48 | 0.9340")):
         assert f"| {method} | quick | 0 | ok |" in own
         assert f"| {method} | {figures} |" in paper
+
+
+def test_the_background_of_the_preset_paper_starts_from_hull_points_and_is_white(watersphere: Path) -> None:
+    """The layout has no sparse points, and the views are white but for the liquid."""
+    settings = BackgroundSettings.preset("paper", {"iterations": 30, "max_anchors": 300})
+    scene = Scene.open(watersphere)
+    background = fit_background(scene.training(), settings, Run(seed=0))
+    view = scene.test[0]
+    image = background.render(scene.cameras[view])
+    assert image[~scene.mask(view, 0)].mean() > 0.97
 
 
 @pytest.mark.parametrize("method", ["splashsplat", "scaffold_4d"])
