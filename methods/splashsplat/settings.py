@@ -42,8 +42,10 @@ class SplashSplatConfig(MethodConfig):
     signed_distance: SignedDistanceMethod = "silhouette"
     #: use the container's mesh, where the scene has one: what it hides, and where its walls are
     container: bool = True
-    #: leave out masks that miss much of the liquid, as well as empty ones
+    #: look for masks that miss much of the liquid, and replace them
     detect_failed_masks: bool = True
+    #: replace empty masks where other views see liquid; in the paper they say that there is none
+    replace_empty_masks: bool = True
     #: carve, and compare photographs, at each camera's own times, where the scene has them
     camera_times: bool = True
     #: level the liquid that rests in the container (needs the mesh and gravity)
@@ -123,6 +125,7 @@ class SplashSplatConfig(MethodConfig):
             "signed_distance": "carve",
             "container": False,
             "detect_failed_masks": False,
+            "replace_empty_masks": False,
             "camera_times": False,
             "pool": False,
             "ballistic": False,
@@ -179,6 +182,7 @@ class SplashSplatConfig(MethodConfig):
             signed_distance=self.signed_distance,
             container=self.container,
             detect_failed_masks=self.detect_failed_masks,
+            replace_empty_masks=self.replace_empty_masks,
             camera_times=self.camera_times,
             pool=self.pool,
             ballistic=self.ballistic,

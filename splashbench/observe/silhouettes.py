@@ -3,7 +3,7 @@
 A view whose mask is empty while other views see liquid is a failed mask, not evidence of absence. So is one that the
 caller has found wanting (failures.py). Either is replaced by what the view saw just before and after, with what is
 left of the mask, or over the whole sequence where those failed too. (Letting k of n views dissent everywhere instead
-was measured to cost .1 mIoU.)
+was measured to cost .1 mIoU.) The paper replaces none: liquid is where the masks of all views have it.
 """
 
 from __future__ import annotations
@@ -123,13 +123,20 @@ class Silhouettes:
     """
 
     def __init__(
-        self, scene: MaskedScene, views: Sequence[str] | None = None, interpolate_times: bool | None = None
+        self,
+        scene: MaskedScene,
+        views: Sequence[str] | None = None,
+        interpolate_times: bool | None = None,
+        replace_empty: bool = True,
     ) -> None:
         """Read the masks of `views` (all training views by default), each once.
 
         interpolate_times: whether a camera that exposes at times of its own (`camera_times` of the scene) is carved
         with at the scene's `times`, between its frames; by default where they differ by over 1% of a step.
-        Raises SplashbenchError when fewer than two views show liquid in any frame.
+        replace_empty: whether an empty mask counts as failed where other views see liquid, or else says that there is
+        none.
+        Raises SplashbenchError when fewer than two views show liquid in any frame, and when a view shows none at all
+        whose empty masks are not replaced.
         """
         self.views = tuple(scene.train if views is None else views)
         self.cameras = [scene.cameras[view] for view in self.views]
@@ -154,7 +161,13 @@ class Silhouettes:
                 "liquid is; check the folder seg/ of the scene"
             )
         enough = self.sees_liquid.sum(axis=1) >= MIN_WITNESSES
-        self.failed_masks = ~self.sees_liquid & enough[:, None]
+        self.failed_masks = ~self.sees_liquid & enough[:, None] & replace_empty
+        if not replace_empty and not self.sees_liquid.any(axis=0).all():
+            dry = [view for view, sees in zip(self.views, self.sees_liquid.any(axis=0)) if not sees]
+            raise SplashbenchError(
+                f"{scene.name}: the masks of camera {', '.join(dry)} show no liquid in any frame, and empty masks are "
+                "not replaced, so that there is none anywhere; set replace_empty_masks=true, or leave the camera out"
+            )
         self._between = [_between(scene, view, interpolate_times) for view in self.views]
 
     def distrust(self, masks: np.ndarray) -> None:

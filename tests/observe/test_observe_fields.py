@@ -12,7 +12,7 @@ from scipy import ndimage
 from splashbench.errors import SplashbenchError
 from splashbench.observe import Bounds, Grid, Silhouettes, sequence_bounds, signed_distance_fields
 from splashbench.observe.kernels import resample, sample
-from splashbench.observe.signed_distance import signed_distance_of
+from splashbench.observe.signed_distance import signed_distance_frames, signed_distance_of
 from splashbench.observe.silhouettes import signed_distance_2d
 from splashbench.scene.camera import Camera, look_at
 
@@ -117,6 +117,22 @@ def test_a_failed_mask_does_not_erase_the_liquid():
     assert Silhouettes(scene).failed(1) == []
     # The ball stands still, so what that camera sees in the other frame stands in for the missing mask exactly.
     np.testing.assert_allclose(broken.phi[0], whole.phi[0], atol=1e-5)
+
+
+def test_an_empty_mask_may_be_taken_at_its_word():
+    scene = Ball()
+    scene.empty = {("3", 0)}
+    silhouettes = Silhouettes(scene, replace_empty=False)
+    assert not silhouettes.failed_masks.any()
+    grid = Grid.over(sequence_bounds(silhouettes).padded(0.1), 32)
+    phi = list(signed_distance_frames(silhouettes, grid, "carve"))
+    # "A voxel is occupied only if it projects inside the liquid masks of all five training views."
+    assert (phi[0] == 20).all()
+    assert (phi[1] < 0).any()
+    scene.empty = {("3", 0), ("3", 1), ("7", 0), ("7", 1)}
+    with pytest.raises(SplashbenchError, match=r"masks of camera 3, 7 show no liquid.*replace_empty_masks=true"):
+        Silhouettes(scene, replace_empty=False)
+    Silhouettes(scene)
 
 
 def test_masks_of_one_view_only_are_an_error_naming_the_scene():

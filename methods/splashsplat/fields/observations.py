@@ -31,7 +31,7 @@ from .occlusion import LiquidOcclusion
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 2
+_REVISION = 3
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class FieldSettings:
     signed_distance: SignedDistanceMethod
     container: bool
     detect_failed_masks: bool
+    replace_empty_masks: bool
     camera_times: bool
     pool: bool
     ballistic: bool
@@ -120,7 +121,11 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
     report(0.0, "reading masks")
     with run.stage("signed distance"):
         observed = reduced(scene, settings.hull_cells) if settings.signed_distance == "silhouette" else scene
-        silhouettes = Silhouettes(observed, interpolate_times=None if settings.camera_times else False)
+        silhouettes = Silhouettes(
+            observed,
+            interpolate_times=None if settings.camera_times else False,
+            replace_empty=settings.replace_empty_masks,
+        )
         container = ContainerOcclusion.of(scene) if settings.container else None
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
     hull_grid, grid = Grid.over(bounds, settings.hull_cells), Grid.over(bounds, settings.transport_cells)

@@ -234,3 +234,4 @@ def test_the_paper_preset_is_the_papers():
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
     assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)
+    assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)

@@ -64,6 +64,7 @@ def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path
         ({"hull_cells": 36}, []),
         ({"signed_distance": "carve"}, []),
         ({"detect_failed_masks": False}, []),
+        ({"replace_empty_masks": False}, []),
         ({"container": False}, []),
         ({"camera_times": False}, []),
         ({"pool": False}, []),
