@@ -23,6 +23,7 @@ from .carriers.population import Carriers
 from .carriers.subframe import Track
 from .motion.fall import falls_of, table_of
 from .motion.steps import Motion
+from .motion.velocity import Factor
 
 FORMAT = 3
 
@@ -30,6 +31,14 @@ FORMAT = 3
 def _position_steps(grid: Grid) -> float:
     """16-bit steps per transport voxel."""
     return 65535 / max(grid.shape)
+
+
+def _factor(stored: int | list[float]) -> Factor:
+    """Transport voxels per control cell, as liquid.json has them."""
+    if not isinstance(stored, list):
+        return int(stored)
+    fx, fy, fz = (float(width) for width in stored)
+    return fx, fy, fz
 
 
 def store_precision(carriers: Carriers, grid: Grid) -> Carriers:
@@ -156,7 +165,7 @@ class Liquid:
             nx, ny, nz = (int(n) for n in box["shape"])
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
             times = np.array(header["times"], dtype=np.float64)
-            factor, count = int(header["factor"]), int(header["carriers"])
+            factor, count = _factor(header["factor"]), int(header["carriers"])
             carried = bool(header["carried"])
             decoder = Decoder(
                 DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})

@@ -92,7 +92,7 @@ def _track(
             steps.append(frame.step)
         with run.stage("carriers"):
             tracker.advance(frame.phi, frame.step)
-    factor = settings.control_factor
+    factor = settings.factor(grid.shape)
     return tracker.carriers(), Motion.of(steps, control_shape(grid.shape, factor), factor), packed
 
 

@@ -38,6 +38,9 @@ class SplashSplatConfig(MethodConfig):
     hull_cells: int = Field(224, ge=16, le=512)
     transport_cells: int = Field(112, ge=16, le=256)
     control_cells: int = Field(28, ge=4, le=128)
+    #: control cells are "cubes", `control_cells` of them along the longest side, or along every one of the "sides" of
+    #: the box, as the paper's 24^3
+    control_grid: Literal["cubes", "sides"] = "cubes"
     #: how phi_t is computed: straight from the "silhouette", or by "carve" as in the paper
     signed_distance: SignedDistanceMethod = "silhouette"
     #: use the container's mesh, where the scene has one: what it hides, and where its walls are
@@ -60,6 +63,8 @@ class SplashSplatConfig(MethodConfig):
     velocity_band: PositiveFloat = 4.0
     velocity_smoothing: float = Field(0.6, ge=0)
     velocity_smooth: Literal["update", "field"] = "update"
+    #: voxels of which grid `velocity_smoothing` is in: the "control" grid's cells, or "transport" voxels
+    velocity_smoothing_unit: Literal["control", "transport"] = "control"
     projection_blend: float = Field(0.35, ge=0, le=1)
     velocity_limit: PositiveFloat = 8.0
     # Carriers
@@ -122,6 +127,7 @@ class SplashSplatConfig(MethodConfig):
             "hull_cells": 176,
             "transport_cells": 96,
             "control_cells": 24,
+            "control_grid": "sides",
             "signed_distance": "carve",
             "container": False,
             "detect_failed_masks": False,
@@ -132,6 +138,7 @@ class SplashSplatConfig(MethodConfig):
             "gate_motion": False,
             "visible_only": False,
             "velocity_smooth": "field",
+            "velocity_smoothing_unit": "transport",
             "kill_inside": None,
             "cell_capacity": None,
             "lifetime": None,
@@ -196,10 +203,17 @@ class SplashSplatConfig(MethodConfig):
             band=self.velocity_band,
             smoothing=self.velocity_smoothing,
             smooth=self.velocity_smooth,
+            smoothing_unit=self.velocity_smoothing_unit,
             projection_blend=self.projection_blend,
             limit=self.velocity_limit,
         )
-        return MotionSettings(self.control_factor, self.gate_motion, self.variant != "per_frame", velocity)
+        return MotionSettings(
+            self.control_factor,
+            self.gate_motion,
+            self.variant != "per_frame",
+            velocity,
+            self.control_cells if self.control_grid == "sides" else None,
+        )
 
     @property
     def carriers(self) -> CarrierSettings:

@@ -162,8 +162,8 @@ class Silhouettes:
             )
         enough = self.sees_liquid.sum(axis=1) >= MIN_WITNESSES
         self.failed_masks = ~self.sees_liquid & enough[:, None] & replace_empty
-        if not replace_empty and not self.sees_liquid.any(axis=0).all():
-            dry = [view for view, sees in zip(self.views, self.sees_liquid.any(axis=0)) if not sees]
+        dry = [view for number, view in enumerate(self.views) if not self.sees_liquid[:, number].any()]
+        if dry and not replace_empty:
             raise SplashbenchError(
                 f"{scene.name}: the masks of camera {', '.join(dry)} show no liquid in any frame, and empty masks are "
                 "not replaced, so that there is none anywhere; set replace_empty_masks=true, or leave the camera out"

@@ -10,7 +10,7 @@ import numpy as np
 
 from splashbench.parallel import over_range
 
-from .velocity import velocity_at
+from .velocity import Factor, factors, velocity_at
 
 MIN_STRETCH, MAX_STRETCH = 1 / 3, 3.0
 _SMALL_LOOP = 1024
@@ -19,7 +19,7 @@ _SMALL_LOOP = 1024
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _forecast(
     control: np.ndarray,
-    factor: int,
+    factor: tuple[float, float, float],
     positions: np.ndarray,
     deformation: np.ndarray,
     duration: float,
@@ -65,15 +65,15 @@ def clamp_stretch(deformation: np.ndarray) -> np.ndarray:
 
 
 def forecast(
-    control: np.ndarray, factor: int, positions: np.ndarray, deformation: np.ndarray, duration: float = 1.0
+    control: np.ndarray, factor: Factor, positions: np.ndarray, deformation: np.ndarray, duration: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions [N, 3] by midpoint RK2 and F by (I + duration grad u) F, singular values clamped.
 
-    control, factor: see `velocity_at`. duration: in frames; a fraction gives the state between two frames.
+    control, factor: see velocity.py. duration: in frames; a fraction gives the state between two frames.
     """
     positions = np.ascontiguousarray(positions, np.float32)
     deformation = np.ascontiguousarray(deformation, np.float32)
     moved, deformed = np.empty_like(positions), np.empty_like(deformation)
-    fixed = (np.ascontiguousarray(control, np.float32), factor, positions, deformation, float(duration))
+    fixed = (np.ascontiguousarray(control, np.float32), factors(factor), positions, deformation, float(duration))
     over_range(_forecast, len(positions), *fixed, moved, deformed, smallest=_SMALL_LOOP)
     return moved, clamp_stretch(deformed)

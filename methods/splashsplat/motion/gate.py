@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from splashbench.observe.kernels import sample
 
 from .advection import forecast
+from .velocity import Factor, cell_numbers
 
 # A fit that takes the liquid's nodes so much farther outside, on average, is not believed (voxels). Of a slow surface
 # the fit shows no gain, and yet is right: most nodes near it are inside before and after.
@@ -18,14 +19,14 @@ _LOSS = 0.01
 _SHELL = 3.0
 
 
-def gated(control: np.ndarray, factor: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def gated(control: np.ndarray, factor: Factor, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """`control` with zero where it takes the liquid of `before` farther outside `after` than no motion does.
 
     control: float32 [cx, cy, cz, 3] voxels per frame. before, after: phi_t and phi_{t+1}, float32 [nx, ny, nz] voxels.
     """
     if not np.any(control):
         return control
-    coarse = control.shape[:3]
+    coarse = control.shape[0], control.shape[1], control.shape[2]
     size = int(np.prod(coarse))
     gains, counts = np.zeros(size), np.zeros(size)
     # Forwards from what is liquid now, which shows where it leaves, and backwards from what will be, where it arrives.
@@ -34,7 +35,7 @@ def gated(control: np.ndarray, factor: int, before: np.ndarray, after: np.ndarra
         identity = np.broadcast_to(np.eye(3, dtype=np.float32), (len(nodes), 3, 3))
         moved, _ = forecast(direction * control, factor, nodes, identity)
         gain = np.maximum(sample(end, nodes), 0) - np.maximum(sample(end, moved), 0)
-        cell = np.ravel_multi_index(tuple(np.minimum(nodes.astype(int) // factor, np.array(coarse) - 1).T), coarse)
+        cell = cell_numbers(nodes, factor, coarse)
         gains += np.bincount(cell, gain, minlength=size)
         counts += np.bincount(cell, minlength=size)
     gains, counts = (gaussian_filter(values.reshape(coarse), 1.0) for values in (gains, counts))

@@ -19,7 +19,7 @@ from ..fields.signed_distance_file import SignedDistanceFile, shared_signed_dist
 from .fall import JetFall
 from .gate import gated
 from .steps import FrameStep
-from .velocity import VelocitySettings, control_shape, fit_velocity
+from .velocity import Factor, VelocitySettings, control_shape, factor_of_sides, fit_velocity
 
 # Parts of the progress in a study, which has phi_t of all frames first, then the velocities, then the carriers.
 _DISTANCES_DONE, _VELOCITIES_DONE = 0.5, 0.9
@@ -27,12 +27,20 @@ _DISTANCES_DONE, _VELOCITIES_DONE = 0.5, 0.9
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """control_factor: transport voxels per control cell. gate: see gate.py. moves: False leaves out all motion."""
+    """control_factor: transport voxels per control cell. gate: see gate.py. moves: False leaves out all motion.
+
+    control_cells: along every side of the box, in place of cubic cells; None for these.
+    """
 
     control_factor: int
     gate: bool = True
     moves: bool = True
     velocity: VelocitySettings = field(default_factory=VelocitySettings)
+    control_cells: int | None = None
+
+    def factor(self, shape: tuple[int, int, int]) -> Factor:
+        """Transport voxels per control cell on a transport grid of `shape`."""
+        return self.control_factor if self.control_cells is None else factor_of_sides(shape, self.control_cells)
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ def _frames(
             packed = pack_signed_distance(now)
         step = None
         if before is not None:
-            step = FrameStep(control(t - 1, before, now), fit.settings.control_factor, fit.fall(t - 1))
+            step = FrameStep(control(t - 1, before, now), fit.factor, fit.fall(t - 1))
         before = now
         yield ObservedFrame(phi, packed, step)
         report(progress + (1 - progress) * (t + 1) / observations.n_frames, what)
@@ -100,13 +108,15 @@ class _MotionFit:
 
     def __init__(self, observations: Observations, times: np.ndarray, settings: MotionSettings, run: Run) -> None:
         self.observations, self.times, self.settings, self.run = observations, times, settings, run
-        shape = control_shape(observations.grid.shape, settings.control_factor)
+        #: transport voxels per control cell
+        self.factor = settings.factor(observations.grid.shape)
+        shape = control_shape(observations.grid.shape, self.factor)
         #: no motion, on the control grid
         self.still = np.zeros((*shape, 3), dtype=np.float32)
 
     def control(self, t: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """u_t on the control grid, float32 [cx, cy, cz, 3] voxels per frame."""
-        settings, factor = self.settings, self.settings.control_factor
+        settings, factor = self.settings, self.factor
         if not settings.moves:
             return self.still
         with self.run.stage("velocity"):

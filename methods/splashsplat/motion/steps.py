@@ -14,7 +14,7 @@ import numpy as np
 
 from .advection import forecast
 from .fall import JetFall
-from .velocity import velocities_at
+from .velocity import Factor, velocities_at
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class FrameStep:
     coarser than the transport grid; fall: of the jet, None without one."""
 
     control: np.ndarray
-    factor: int
+    factor: Factor
     fall: JetFall | None = None
 
     def velocity(self, positions: np.ndarray) -> np.ndarray:
@@ -59,11 +59,11 @@ class Motion:
     """
 
     velocities: np.ndarray
-    factor: int
+    factor: Factor
     falls: Sequence[JetFall | None]
 
     @classmethod
-    def of(cls, steps: Sequence[FrameStep], shape: tuple[int, int, int], factor: int) -> Motion:
+    def of(cls, steps: Sequence[FrameStep], shape: tuple[int, int, int], factor: Factor) -> Motion:
         """The motion of `steps`, on a control grid of `shape`."""
         velocities = np.stack([step.control for step in steps]) if steps else np.zeros((0, *shape, 3), np.float32)
         return cls(velocities, factor, [step.fall for step in steps])

@@ -5,12 +5,14 @@ step: per-node Gauss-Newton displacement, averaged per control cell, Gaussian-sm
 divergence-free projection, clipped. Lengths are in transport voxels and velocities in voxels per frame, whatever the
 frame lasts.
 
-The paper smooths the field after each step, which keeps shrinking it towards zero; smoothing the update only was
-measured to carry farther, and is the default.
+The paper smooths the field after each step, which shrinks it towards zero the more, the wider the Gaussian; smoothing
+the update only was measured to carry farther, and is the default. Its width is given in voxels, and of which grid is
+open: the band and the bound in the same sentence are in transport voxels.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,24 +25,48 @@ from splashbench.parallel import over_range
 
 _SMALL_LOOP = 1024
 
+#: Transport voxels per control cell: one number, or one along each axis where the cells are no cubes.
+Factor = int | tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class VelocitySettings:
-    """Settings of the fit; the defaults are the paper's, except `smooth`."""
+    """Settings of the fit; the defaults are the paper's, except `smooth` and `smoothing_unit`, whose voxels `smoothing`
+    is in: the "control" grid's cells or "transport" voxels."""
 
     steps: int = 35
     step_size: float = 0.45
     band: float = 4.0
     smoothing: float = 0.6
     smooth: Literal["update", "field"] = "update"
+    smoothing_unit: Literal["control", "transport"] = "control"
     projection_blend: float = 0.35
     limit: float = 8.0
 
 
-def control_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:
+def factors(factor: Factor) -> tuple[float, float, float]:
+    """Transport voxels per control cell along each axis."""
+    if isinstance(factor, tuple):
+        return factor
+    return float(factor), float(factor), float(factor)
+
+
+def control_shape(shape: tuple[int, int, int], factor: Factor) -> tuple[int, int, int]:
     """Shape of the control grid whose cells are `factor` voxels of a transport grid of `shape`."""
-    nx, ny, nz = (max(-(-n // factor), 2) for n in shape)
+    nx, ny, nz = (max(math.ceil(n / f - 1e-6), 2) for n, f in zip(shape, factors(factor)))
     return nx, ny, nz
+
+
+def factor_of_sides(shape: tuple[int, int, int], cells: int) -> Factor:
+    """The factor with `cells` control cells along every side of a transport grid of `shape`, none below a voxel."""
+    fx, fy, fz = (max(n / cells, 1.0) for n in shape)
+    return fx, fy, fz
+
+
+def cell_numbers(nodes: np.ndarray, factor: Factor, coarse: tuple[int, int, int]) -> np.ndarray:
+    """Number of the control cell of each transport node [N, 3], int64 [N], on a control grid of shape `coarse`."""
+    cells = np.floor((nodes + 0.5) / np.array(factors(factor))).astype(np.int64)
+    return np.asarray(np.ravel_multi_index(tuple(np.minimum(cells, np.array(coarse) - 1).T), coarse))
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -54,10 +80,17 @@ def _locate(shape: tuple[int, ...], x: float, y: float, z: float) -> tuple[int, 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def velocity_at(control: np.ndarray, factor: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """u at transport-grid coordinates (x, y, z); control: [cx, cy, cz, 3], nodes at the middles of their cells."""
-    shift = 0.5 * (factor - 1)
-    i, j, k, a, b, c = _locate(control.shape, (x - shift) / factor, (y - shift) / factor, (z - shift) / factor)
+def velocity_at(
+    control: np.ndarray, factor: tuple[float, float, float], x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """u at transport-grid coordinates (x, y, z); control: [cx, cy, cz, 3], nodes at the middles of their cells.
+
+    factor: transport voxels per control cell along each axis.
+    """
+    fx, fy, fz = factor
+    i, j, k, a, b, c = _locate(
+        control.shape, (x - 0.5 * (fx - 1)) / fx, (y - 0.5 * (fy - 1)) / fy, (z - 0.5 * (fz - 1)) / fz
+    )
     u, v, w = 0.0, 0.0, 0.0
     for di in range(2):
         wi = a if di else 1 - a
@@ -73,18 +106,24 @@ def velocity_at(control: np.ndarray, factor: int, x: float, y: float, z: float) 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _velocities_at(
-    control: np.ndarray, factor: int, positions: np.ndarray, velocities: np.ndarray, start: int, stop: int
+    control: np.ndarray,
+    factor: tuple[float, float, float],
+    positions: np.ndarray,
+    velocities: np.ndarray,
+    start: int,
+    stop: int,
 ) -> None:
     for n in range(start, stop):
         u, v, w = velocity_at(control, factor, positions[n, 0], positions[n, 1], positions[n, 2])
         velocities[n, 0], velocities[n, 1], velocities[n, 2] = u, v, w
 
 
-def velocities_at(control: np.ndarray, factor: int, positions: np.ndarray) -> np.ndarray:
-    """u at transport-grid `positions` [N, 3], float64 [N, 3], voxels per frame; control, factor: see `velocity_at`."""
+def velocities_at(control: np.ndarray, factor: Factor, positions: np.ndarray) -> np.ndarray:
+    """u at transport-grid `positions` [N, 3], float64 [N, 3], voxels per frame; control: see `velocity_at`."""
     velocities = np.empty((len(positions), 3))
     control, positions = np.ascontiguousarray(control, np.float32), np.ascontiguousarray(positions, np.float64)
-    over_range(_velocities_at, len(positions), control, factor, positions, velocities, smallest=_SMALL_LOOP)
+    fixed = (control, factors(factor), positions)
+    over_range(_velocities_at, len(positions), *fixed, velocities, smallest=_SMALL_LOOP)
     return velocities
 
 
@@ -93,7 +132,7 @@ def _descend(
     before: np.ndarray,
     after: np.ndarray,
     control: np.ndarray,
-    factor: int,
+    factor: tuple[float, float, float],
     nodes: np.ndarray,
     starts: np.ndarray,
     step: float,
@@ -136,17 +175,18 @@ def _descend(
 class DivergenceFree:
     """Projection of fields [nx, ny, nz, 3] onto divergence-free ones, by Fourier transform with zero padding.
 
-    The symbol is that of the central difference, so it is this discrete divergence that vanishes. Padding to twice
-    the size keeps opposite faces from seeing each other. The padding is a multiple of the field; axis by axis, most of
-    it need not be transformed.
+    The symbol is that of the central difference, so it is this discrete divergence that vanishes; spacing: of the
+    nodes along each axis. Padding to twice the size keeps opposite faces from seeing each other. The padding is a
+    multiple of the field; axis by axis, most of it need not be transformed.
     """
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
+    def __init__(self, shape: tuple[int, int, int], spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         self.shape = shape
         self.padded = tuple(fft.next_fast_len(2 * n, real=True) for n in shape)
         px, py, pz = self.padded
         waves = (np.fft.fftfreq(px)[:, None, None], np.fft.fftfreq(py)[:, None], np.fft.rfftfreq(pz))
-        self.symbol = [np.sin(2 * np.pi * wave).astype(np.float32) for wave in waves]
+        relative = [width / min(spacing) for width in spacing]
+        self.symbol = [(np.sin(2 * np.pi * wave) / width).astype(np.float32) for wave, width in zip(waves, relative)]
         square = np.square(self.symbol[0]) + np.square(self.symbol[1]) + np.square(self.symbol[2])
         self.inverse = np.where(square > 1e-9, 1 / np.maximum(square, 1e-9), 0).astype(np.float32)
 
@@ -181,7 +221,7 @@ class VelocityFit:
 
 
 def fit_velocity(
-    before: np.ndarray, after: np.ndarray, factor: int, settings: VelocitySettings | None = None
+    before: np.ndarray, after: np.ndarray, factor: Factor, settings: VelocitySettings | None = None
 ) -> VelocityFit:
     """Fit u_t to phi_t (`before`) and phi_{t+1} (`after`), float32 [nx, ny, nz] in voxels of their grid.
 
@@ -194,20 +234,23 @@ def fit_velocity(
     if not band.any() or not (before < 0).any() or not (after < 0).any():
         return VelocityFit(control, 0.0, 0.0)
     nodes = np.argwhere(band).astype(np.int32)
-    cell = np.ravel_multi_index(tuple(np.minimum(nodes // factor, np.array(coarse) - 1).T), coarse)
+    cell = cell_numbers(nodes, factor, coarse)
     order = np.argsort(cell, kind="stable")
     nodes = np.ascontiguousarray(nodes[order])
     cells = int(np.prod(coarse))
     starts = np.searchsorted(cell[order], np.arange(cells + 1))
     counts = np.diff(starts).reshape(*coarse, 1).astype(np.float32)
-    weight = _smoothed(counts, settings.smoothing) + np.float32(1e-3)
-    divergence_free = DivergenceFree(coarse)
+    voxels = factors(factor)
+    in_voxels = settings.smoothing_unit == "transport"
+    sigma = tuple(settings.smoothing / (width if in_voxels else 1.0) for width in voxels)
+    weight = _smoothed(counts, sigma) + np.float32(1e-3)
+    divergence_free = DivergenceFree(coarse, voxels)
 
     with_gradient = np.stack([before, *np.gradient(before)], axis=-1).astype(np.float32)
 
     def descend() -> tuple[np.ndarray, float]:
         update, residual = np.zeros((cells, 3), np.float32), np.zeros(cells, np.float32)
-        fixed = (with_gradient, after, control, factor, nodes, starts, settings.step_size)
+        fixed = (with_gradient, after, control, voxels, nodes, starts, settings.step_size)
         over_range(_descend, cells, *fixed, update, residual)
         return update.reshape(*coarse, 3), float(residual.sum(dtype=np.float64) / len(nodes))
 
@@ -217,9 +260,9 @@ def fit_velocity(
         first = residual if first is None else first
         if settings.smooth == "update":
             # Normalised by the equally smoothed count: cells without band nodes take their neighbours' motion.
-            control += _smoothed(update, settings.smoothing) / weight
+            control += _smoothed(update, sigma) / weight
         else:
-            control = _smoothed(control + update / np.maximum(counts, 1), settings.smoothing)
+            control = _smoothed(control + update / np.maximum(counts, 1), sigma)
         blend = settings.projection_blend
         control = (1 - blend) * control + blend * divergence_free(control)
         speed = np.sqrt((control**2).sum(axis=-1, keepdims=True))
@@ -228,6 +271,6 @@ def fit_velocity(
     return VelocityFit(control, first or 0.0, descend()[1])
 
 
-def _smoothed(field: np.ndarray, sigma: float) -> np.ndarray:
-    """Gaussian smoothing along the three spatial axes of [nx, ny, nz, channels]."""
-    return gaussian_filter(field, (sigma, sigma, sigma, 0))
+def _smoothed(field: np.ndarray, sigma: tuple[float, ...]) -> np.ndarray:
+    """Gaussian smoothing of [nx, ny, nz, channels] along the three spatial axes, `sigma` cells along each."""
+    return gaussian_filter(field, (*sigma, 0))

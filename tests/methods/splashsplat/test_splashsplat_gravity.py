@@ -156,6 +156,7 @@ def test_slices_cut_by_an_image_edge_are_left_out():
 GRID = Grid(np.array([-0.1, 0.0, -0.1]), VOXEL, (40, 64, 40))
 JET = Jet(0.3, np.array([0.0, 0.0]), np.array([0.2, -0.1]), 1.0, G, 0.01)
 FALL = JetFall(JET, 0.1, upright(DOWN), GRID, 0.033)
+FOURS = (4.0, 4.0, 4.0)
 SIDEWAYS = np.broadcast_to(np.float32([1, 0, 0]), (*control_shape(GRID.shape, 4), 3))
 
 
@@ -233,11 +234,11 @@ def test_a_fit_that_leads_nowhere_is_dropped_and_one_that_leads_home_is_kept():
     right = np.zeros((10, 10, 10, 3), np.float32)
     right[..., 0] = 3
     kept = gated(right, 4, ball(17), ball(20))
-    assert velocity_at(kept, 4, 24.0, 20.0, 20.0)[0] == pytest.approx(3)
-    assert np.abs(velocity_at(gated(right, 4, ball(17), ball(17)), 4, 17.0, 20.0, 20.0)).max() == 0
+    assert velocity_at(kept, FOURS, 24.0, 20.0, 20.0)[0] == pytest.approx(3)
+    assert np.abs(velocity_at(gated(right, 4, ball(17), ball(17)), FOURS, 17.0, 20.0, 20.0)).max() == 0
     # A slow surface gains next to nothing by its own motion, and keeps it.
     slow = 0.02 * right
-    assert velocity_at(gated(slow, 4, ball(17), ball(17.06)), 4, 20.0, 20.0, 20.0)[0] == pytest.approx(0.06)
+    assert velocity_at(gated(slow, 4, ball(17), ball(17.06)), FOURS, 20.0, 20.0, 20.0)[0] == pytest.approx(0.06)
 
 
 def test_motion_that_takes_arriving_liquid_away_from_where_it_was_is_dropped():
@@ -247,8 +248,8 @@ def test_motion_that_takes_arriving_liquid_away_from_where_it_was_is_dropped():
     # Liquid up to x = 8, then up to 16. What is liquid now stays inside when it moves left. What arrives at 16 would
     # have come from 24, farther outside than 16 itself.
     gated_motion = gated(left, 4, x - 8, x - 16)
-    assert np.abs(velocity_at(gated_motion, 4, 15.0, 20.0, 20.0)).max() == 0
-    assert np.abs(velocity_at(gated_motion, 4, 36.0, 20.0, 20.0)).max() == 0  # no liquid tells anything there
+    assert np.abs(velocity_at(gated_motion, FOURS, 15.0, 20.0, 20.0)).max() == 0
+    assert np.abs(velocity_at(gated_motion, FOURS, 36.0, 20.0, 20.0)).max() == 0  # no liquid tells anything there
 
 
 # The pool

@@ -16,6 +16,7 @@ from splashbench.synth.balls import ball_centers, write_balls_scene
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.carriers.subframe import locate
 from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.motion.velocity import control_shape
 from splashbench_methods.splashsplat.reconstruction import fit_liquid
 
 TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
@@ -225,12 +226,14 @@ def test_a_scene_without_masks_is_not_supported(balls: Scene):
 def test_the_paper_preset_is_the_papers():
     paper = SplashSplatConfig.preset("paper")
     assert (paper.hull_cells, paper.transport_cells, paper.control_cells) == (176, 96, 24)
-    assert paper.control_factor == 4
+    # 24^3 control cells in any box, and 0.6 transport voxels.
+    assert control_shape((96, 37, 53), paper.motion.factor((96, 37, 53))) == (24, 24, 24)
     assert (paper.iterations, paper.learning_rate_features, paper.learning_rate_heads) == (3000, 2e-3, 2e-3)
     weights = paper.optimisation.weights
     assert tuple(vars(weights).values()) == (0.5, 0.1, 0.2, 0.7, 0.01, 0.1, 1.0)
     velocity = paper.motion.velocity
     assert (velocity.steps, velocity.step_size, velocity.band, velocity.limit) == (35, 0.45, 4.0, 8.0)
+    assert (velocity.smooth, velocity.smoothing, velocity.smoothing_unit) == ("field", 0.6, "transport")
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
     assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)

@@ -23,6 +23,8 @@ from splashbench_methods.splashsplat.motion.velocity import (
     VelocityFit,
     VelocitySettings,
     control_shape,
+    factor_of_sides,
+    factors,
     fit_velocity,
     velocity_at,
 )
@@ -52,7 +54,7 @@ def central_divergence(field: np.ndarray) -> np.ndarray:
 def surface_motion(fit: VelocityFit, phi: np.ndarray) -> np.ndarray:
     """Mean velocity over the surface phi = 0, [3]."""
     surface = np.argwhere(np.abs(phi) < 0.5)
-    return np.mean([velocity_at(fit.control, FACTOR, *map(float, node)) for node in surface], axis=0)
+    return np.mean([velocity_at(fit.control, factors(FACTOR), *map(float, node)) for node in surface], axis=0)
 
 
 @pytest.mark.parametrize("motion", [(1.0, 0.0, 0.0), (0.0, -0.7, 0.7)])
@@ -67,6 +69,50 @@ def test_smoothing_the_field_instead_of_the_update_shrinks_the_motion():
     field, update = (fit_velocity(before, after, FACTOR, VelocitySettings(smooth=s)) for s in ("field", "update"))
     assert 0.5 < surface_motion(field, before)[0] < 1.5
     assert 1.7 < surface_motion(update, before)[0] < 2.1
+
+
+def test_the_gaussian_shrinks_the_motion_less_where_its_width_is_in_transport_voxels():
+    """A ball of radius 12 moved by 6 voxels, smoothed by a sigma of 0.6 in either unit (the field, as in the paper)."""
+    before, after = ball((14, 20, 20), 12.0), ball((20, 20, 20), 12.0)
+    control, transport = (
+        fit_velocity(before, after, FACTOR, VelocitySettings(smooth="field", smoothing_unit=unit))
+        for unit in ("control", "transport")
+    )
+    found = [surface_motion(fit, before)[0] for fit in (control, transport)]
+    assert found[0] < 4.3
+    assert found[1] > found[0] + 0.6
+    # A width of 2.4 transport voxels is one of 0.6 control cells.
+    wide = VelocitySettings(smooth="field", smoothing=0.6 * FACTOR, smoothing_unit="transport")
+    np.testing.assert_array_equal(fit_velocity(before, after, FACTOR, wide).control, control.control)
+
+
+def test_the_control_grid_may_have_as_many_cells_along_every_side_of_a_long_box():
+    """As the paper's 24^3, whatever the box; a translation is found on such cells, too."""
+    shape = (20, 60, 20)
+    factor = factor_of_sides(shape, 10)
+    assert (factor, control_shape(shape, factor)) == ((2.0, 6.0, 2.0), (10, 10, 10))
+    assert control_shape((8, 60, 20), factor_of_sides((8, 60, 20), 10)) == (8, 10, 10)  # no finer than a voxel
+    nodes = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1).astype(np.float32)
+    before, after = (
+        (np.linalg.norm(nodes - np.float32((10, y, 10)), axis=-1) - np.float32(6)).astype(np.float32) for y in (30, 31)
+    )
+    fit = fit_velocity(before, after, factor)
+    assert fit.control.shape == (10, 10, 10, 3)
+    surface = np.argwhere(np.abs(before) < 0.5)
+    found = np.mean([velocity_at(fit.control, factor, *map(float, node)) for node in surface], axis=0)
+    np.testing.assert_allclose(found, (0, 1, 0), atol=0.15)
+
+
+def test_the_projection_knows_how_far_apart_its_nodes_are():
+    """A field without divergence on cells three times as long along y as along x."""
+    index = np.stack(np.meshgrid(np.arange(31.0), np.arange(15.0), np.arange(9.0), indexing="ij"), axis=-1)
+    place = index * np.array([1.0, 3.0, 1.0]) - np.array([15.0, 21.0, 4.0])
+    potential = np.exp(-(place**2 / (2 * np.array([3.0, 7.0, 1.0]) ** 2)).sum(axis=-1))
+    slopes = np.gradient(potential, 1.0, 3.0, 1.0)
+    curl = np.stack([slopes[1], -slopes[0], np.zeros_like(potential)], axis=-1)
+    project = DivergenceFree((31, 15, 9), (2.0, 6.0, 2.0))
+    assert np.abs(project(curl) - curl).max() < 2e-2 * np.abs(curl).max()
+    assert np.abs(DivergenceFree((31, 15, 9))(curl) - curl).max() > 0.1 * np.abs(curl).max()
 
 
 def test_velocity_is_zero_where_nothing_moves_or_nothing_is():
