@@ -11,6 +11,7 @@ import torch
 
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Method, Render, Run, Support
+from splashbench.render import Frozen, freeze
 from splashbench.scene.camera import Camera
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.particles import Particles
@@ -34,19 +35,26 @@ _BACKGROUND = 0.25
 
 
 class FittedSplashSplat(Fitted):
-    """Liquid over a frozen background: in front of it, but for what the container hides."""
+    """Liquid and a frozen background. It lies in front, but for what the container hides; or, by the liquid's
+    `composition`, the Gaussians of both are drawn together by depth."""
 
     def __init__(self, liquid: Liquid, background: Background, occlusion: LiquidOcclusion | None = None) -> None:
         self.liquid = liquid
         self.background = background
         self.occlusion = occlusion
         self._background_image: tuple[Camera, np.ndarray] | None = None
+        self._frozen: tuple[Camera, Frozen] | None = None
 
     def _background(self, camera: Camera) -> np.ndarray:
         # Videos ask for one camera many times in a row, and nothing in the background moves.
         if self._background_image is None or self._background_image[0] is not camera:
             self._background_image = camera, np.asarray(self.background.render(camera), dtype=np.float32)
         return self._background_image[1]
+
+    def _frozen_background(self, camera: Camera) -> Frozen:
+        if self._frozen is None or self._frozen[0] is not camera:
+            self._frozen = camera, freeze(*self.background.gaussians(camera), camera)
+        return self._frozen[1]
 
     @torch.no_grad()
     def children(self, camera: Camera, time: float) -> Children | None:
@@ -74,12 +82,16 @@ class FittedSplashSplat(Fitted):
     @torch.no_grad()
     def render(self, camera: Camera, time: float) -> Render:
         """The view of `camera` at `time` (seconds), any time; between frames see carriers/between.py."""
-        background = torch.from_numpy(self._background(camera))
         children = self.children(camera, time)
         if children is None:
-            return Render(background.numpy().copy(), np.zeros(background.shape[:2], dtype=np.float32))
+            background = self._background(camera)
+            return Render(background.copy(), np.zeros(background.shape[:2], dtype=np.float32))
         with one_torch_thread():
-            rgb, alpha = composite(children, camera, background)
+            if self.liquid.composition == "together":
+                far = torch.from_numpy(self.background.far_color)
+                rgb, alpha = composite(children, camera, far, self._frozen_background(camera))
+            else:
+                rgb, alpha = composite(children, camera, torch.from_numpy(self._background(camera)))
             return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
 
     def particles(self) -> Particles:
@@ -121,10 +133,17 @@ class SplashSplat(Method):
 
         with run.stage("background"), one_torch_thread():
             background = shared_background(scene, config.background, run, span=(0, _BACKGROUND))
-        images = {
-            name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()
-        }
-        liquid, occlusion = fit_liquid(scene, images, config, run, span=(_BACKGROUND, 1))
+        frozen: dict[str, Frozen] | None = None
+        if config.composition == "together":
+            behind = dict.fromkeys(scene.train, background.far_color)
+            frozen = {
+                name: freeze(*background.gaussians(scene.cameras[name]), scene.cameras[name]) for name in scene.train
+            }
+        else:
+            behind = {
+                name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()
+            }
+        liquid, occlusion = fit_liquid(scene, behind, config, run, span=(_BACKGROUND, 1), frozen=frozen)
         return FittedSplashSplat(liquid, background, occlusion)
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:

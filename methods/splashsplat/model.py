@@ -18,7 +18,7 @@ from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles
 
 from .appearance.decoder import Decoder, DecoderSettings
-from .appearance.fitting import Appearance
+from .appearance.fitting import Appearance, Composition
 from .carriers.population import Carriers
 from .carriers.subframe import Track
 from .motion.fall import falls_of, table_of
@@ -58,7 +58,8 @@ class Liquid:
     """The dynamic foreground.
 
     times: [T] seconds. grid: the transport grid. carriers, motion: in the precision of the files. phi: int8 [T, nx, ny,
-    nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers.
+    nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers. composition: how it was
+    fitted and is drawn: "over" an image of the background, or "together" with the background's Gaussians.
     """
 
     times: np.ndarray
@@ -68,6 +69,7 @@ class Liquid:
     phi: np.ndarray
     appearance: Appearance
     carried: bool = True
+    composition: Composition = "over"
 
     @classmethod
     def of(
@@ -79,11 +81,12 @@ class Liquid:
         phi: np.ndarray,
         appearance: Appearance,
         carried: bool = True,
+        composition: Composition = "over",
     ) -> Liquid:
         """Bring the learned tables and the motion to the precision of the files."""
         halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
         appearance = Appearance(halves[0], halves[1], appearance.decoder)
-        return cls(times, grid, carriers, motion.half(), phi, appearance, carried)
+        return cls(times, grid, carriers, motion.half(), phi, appearance, carried, composition)
 
     @property
     def track(self) -> Track:
@@ -129,6 +132,7 @@ class Liquid:
             "factor": self.motion.factor,
             "carriers": self.carriers.count,
             "carried": self.carried,
+            "composition": self.composition,
             "decoder": dict(vars(settings)),
         }
         write_json(directory / "liquid.json", header)
@@ -167,6 +171,8 @@ class Liquid:
             times = np.array(header["times"], dtype=np.float64)
             factor, count = _factor(header["factor"]), int(header["carriers"])
             carried = bool(header["carried"])
+            # Models of before there was a choice do not say.
+            composition: Composition = "together" if header.get("composition") == "together" else "over"
             decoder = Decoder(
                 DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})
             )
@@ -207,4 +213,4 @@ class Liquid:
             torch.from_numpy(tables["log_scales"].astype(np.float32)),
             decoder,
         )
-        return cls(times, grid, carriers, motion, phi, appearance, carried)
+        return cls(times, grid, carriers, motion, phi, appearance, carried, composition)

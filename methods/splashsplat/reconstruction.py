@@ -6,7 +6,7 @@ with what moved the liquid there, `carriers` follow frame by frame, and `appeara
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.observe.container import solid_distance
+from splashbench.render import Frozen
 from splashbench.scene.scene import TrainingScene
 
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
@@ -45,10 +46,12 @@ def fit_liquid(
     config: SplashSplatConfig,
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
+    frozen: Mapping[str, Frozen] | None = None,
 ) -> tuple[Liquid, LiquidOcclusion | None]:
     """Reconstruct the liquid of `scene`; and what hides it from cameras.
 
-    backgrounds: float32 [H, W, 3] of every training view, in [0, 1]. span: the part of `run`'s progress this takes up.
+    backgrounds: float32 [H, W, 3] of every training view, in [0, 1]; or [3] where `frozen` has the background's
+    Gaussians of every view, to be drawn together with the liquid's. span: the part of `run`'s progress this takes up.
     """
 
     def report(fraction: float, message: str) -> None:
@@ -67,6 +70,7 @@ def fit_liquid(
             observations,
             scene,
             backgrounds,
+            frozen,
             config,
             run.seed,
             lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
@@ -74,7 +78,8 @@ def fit_liquid(
         carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
     # What moves the carriers of the other variants is not u_t.
     carried = config.variant in ("full", "no_resampling")
-    liquid = Liquid.of(scene.times, observations.grid, carriers, motion, packed, appearance, carried)
+    composition = config.composition if frozen is not None else "over"
+    liquid = Liquid.of(scene.times, observations.grid, carriers, motion, packed, appearance, carried, composition)
     return liquid, observations.occlusion
 
 
@@ -149,6 +154,7 @@ def _fit_appearance(
     observations: Observations,
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],
+    frozen: Mapping[str, Frozen] | None,
     config: SplashSplatConfig,
     seed: int,
     progress: Callable[[float], None],
@@ -164,6 +170,7 @@ def _fit_appearance(
         camera_times=config.camera_times,
         trusted=~observations.silhouettes.failed_masks,
         hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
+        frozen=frozen,
     )
     if targets:
         color_cell = observations.hull_grid.voxel / voxel

@@ -15,8 +15,9 @@ from splashbench.harness.contract import MethodConfig
 from splashbench.observe.signed_distance import SignedDistanceMethod
 
 from .appearance.decoder import DecoderSettings
-from .appearance.fitting import FitSettings
+from .appearance.fitting import Composition, FitSettings
 from .appearance.losses import LossWeights
+from .appearance.targets import SilhouetteNorm
 from .carriers.resampling import ShellSettings
 from .carriers.tracking import CarrierSettings, TrackingVariant
 from .fields.observations import FieldSettings
@@ -100,7 +101,10 @@ class SplashSplatConfig(MethodConfig):
     validation_share: float = Field(0.04, ge=0, le=0.1)
     stop_gain: float = Field(0.01, ge=0, lt=1)
     ssim_every: PositiveInt = 1
-    silhouette_norm: Literal["image", "mask"] = "image"
+    #: what the silhouette term is averaged over: the "image", the "window" around all masks of the view, or the "mask"
+    silhouette_norm: SilhouetteNorm = "window"
+    #: the liquid is drawn "over" an image of the background, or "together" with the background's Gaussians, by depth
+    composition: Composition = "over"
     foreground_weight: float = Field(0.5, ge=0)
     gradient_weight: float = Field(0.1, ge=0)
     ssim_weight: float = Field(0.2, ge=0)
@@ -152,6 +156,8 @@ class SplashSplatConfig(MethodConfig):
             "learning_rate_scales": 2e-3,
             "feature_cells": (),
             "anneal": False,
+            "silhouette_norm": "image",
+            "composition": "together",
             "validation_share": 0.0,
             "prune_opacity": 0.0,
             "background_preset": "paper",

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from splashbench.errors import SplashbenchError
-from splashbench.render import rasterize
+from splashbench.render import Frozen, rasterize
 from splashbench.scene.camera import Camera
 
 from ..carriers.subframe import Track
@@ -26,6 +27,9 @@ from .optimizer import RowAdam
 from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
 from .shared_features import SharedFeatures
 from .targets import TrainingTarget
+
+#: The liquid is drawn "over" an image of the background, or "together" with the background's Gaussians.
+Composition = Literal["over", "together"]
 
 # Iterations between two looks at the withheld photographs.
 _LOOK_EVERY = 100
@@ -77,18 +81,28 @@ def initial_appearance(
     return Appearance(features, torch.full((count, 3), initial_log_scale(settings.base_scale, voxel)), heads)
 
 
-def composite(children: Children, camera: Camera, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Liquid over the background (liquid in front): rgb [h, w, 3] and the liquid's opacity [h, w]."""
+def composite(
+    children: Children,
+    camera: Camera,
+    background: Tensor,
+    frozen: Frozen | None = None,
+    modes: np.ndarray | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Liquid and background: rgb [h, w, 3], and the opacity [h, w] of the liquid alone.
+
+    background: [h, w, 3] or [3], behind everything. frozen: the background's Gaussians for this camera, which are drawn
+    in one order of depth with the liquid's (Eq. rendering); without them the liquid lies in front. modes: the tiles
+    in which colours are needed, for the former. The opacity is "obtained by rasterizing G^fg alone" (supplement).
+    """
+    shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
+    colors = children.colors.flatten(0, 1)
     image: Tensor
     alpha: Tensor
-    image, alpha = rasterize(
-        children.means.flatten(0, 1),
-        children.factors.flatten(0, 1),
-        children.opacities.flatten(),
-        children.colors.flatten(0, 1),
-        camera,
-        background=background,
-    )
+    if frozen is None:
+        image, alpha = rasterize(*shapes, colors, camera, background=background)
+    else:
+        image, _ = rasterize(*shapes, colors, camera, background=background, frozen=frozen, modes=modes)
+        _, alpha = rasterize(*shapes, None, camera)
     return image, alpha
 
 
@@ -167,7 +181,8 @@ def fit_appearance(
         state = replace(state, visibility=target.visibility)
         of_cells = cells[target.frame] if penalised else None
         children, penalty_terms = decoder.decode(frame_features, frame_scales, None, state, target.eye, of_cells)
-        return *composite(children, target.camera, target.background), penalty_terms
+        images = composite(children, target.camera, target.background, target.frozen, target.modes)
+        return *images, penalty_terms
 
     def of_frame(t: int) -> tuple[Tensor, Tensor]:
         return features.of_frame(t), appearance.log_scales.index_select(0, ids[t])

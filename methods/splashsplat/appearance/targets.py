@@ -1,25 +1,30 @@
 """Training targets: for each time-camera pair, the window of the image that the liquid and its carriers cover.
 
 Outside the window neither mask nor carriers reach, so the losses lose nothing by leaving it out, and rasterising the
-window alone is several times cheaper than the whole view. Of photograph and mask a target keeps the mask's bounding box
-and 8 pixels around it, at four bytes a pixel; backgrounds are shared.
+window alone is several times cheaper than the whole view. Where the silhouette term is the image's, as in the paper,
+the window is the image: Gaussians that reach far beyond their carriers are held to it, too. Of photograph and mask a
+target keeps the mask's bounding box and 8 pixels around it, at four bytes a pixel; backgrounds are shared.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.render import Frozen, tile_modes
 from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import WindowPhotograph
+
+SilhouetteNorm = Literal["image", "window", "mask"]
 
 MASK_MARGIN = 8
 # A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
@@ -32,8 +37,10 @@ class TrainingTarget:
 
     frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
     window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
-    kept. background: float32 [h, w, 3] in [0, 1], a view of the camera's own. area: pixels over which the silhouette
-    term averages. hidden: bool [n], carriers of the frame that the container hides from the view, or None.
+    kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all Gaussians. area: pixels over which the
+    silhouette term averages. hidden: bool [n], carriers of the frame that the container hides from the view, or None.
+    frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
+    the losses read, see `splashbench.render.tile_modes`.
     """
 
     frame: int
@@ -44,6 +51,8 @@ class TrainingTarget:
     background: Tensor
     area: float
     hidden: Tensor | None = None
+    frozen: Frozen | None = None
+    modes: np.ndarray | None = None
 
     @property
     def visibility(self) -> Tensor | None:
@@ -79,22 +88,33 @@ def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) 
     )
 
 
+def _modes(camera: Camera, box: tuple[int, int, int, int]) -> np.ndarray:
+    """Tiles of the whole image in which the losses read colours: those of `box`."""
+    read = np.zeros((camera.height, camera.width), dtype=bool)
+    read[box[1] : box[3], box[0] : box[2]] = True
+    return tile_modes(read)
+
+
 def collect_targets(
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],
     track: Track,
-    silhouette_norm: str,
+    silhouette_norm: SilhouetteNorm,
     camera_times: bool = False,
     trusted: np.ndarray | None = None,
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
+    frozen: Mapping[str, Frozen] | None = None,
 ) -> list[TrainingTarget]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
-    backgrounds: float32 [H, W, 3] of each training view. camera_times: whether a photograph shows the liquid at its
-    camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name and
-    positions [n, 3], which of them the container hides (bool [n]). silhouette_norm: "image" averages the silhouette
-    term over the view's sequence-wide liquid window (the paper's images are such crops), "mask" over the mask.
+    backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
+    its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
+    and positions [n, 3], which of them the container hides (bool [n]). frozen: of each view, Gaussians of the
+    background that are drawn together with the liquid's. silhouette_norm: the silhouette term averages over the
+    "image", as in the paper, whose images are crops about the liquid; or over the "window" around all masks of the
+    view, such a crop of images that are none; or over the "mask".
     """
+    frozen = frozen or {}
     targets = []
     for view, name in enumerate(scene.train):
         camera = scene.cameras[name]
@@ -103,7 +123,8 @@ def collect_targets(
         if not ever.any():
             continue
         x0, y0, x1, y1 = _extent(ever, MASK_MARGIN)
-        crop_area = float((x1 - x0) * (y1 - y0))
+        areas = {"image": float(ever.size), "window": float((x1 - x0) * (y1 - y0))}
+        whole = silhouette_norm == "image" or name in frozen
         eye = torch.tensor(camera.center, dtype=torch.float32)
         taken = scene.camera_times[name] if camera_times else scene.times
         for t, mask in enumerate(masks):
@@ -115,7 +136,7 @@ def collect_targets(
             if len(positions) == 0:
                 continue
             box = _extent(mask, MASK_MARGIN)
-            x0, y0, x1, y1 = _window(camera, box, positions)
+            x0, y0, x1, y1 = (0, 0, camera.width, camera.height) if whole else _window(camera, box, positions)
             part = slice(box[1], box[3]), slice(box[0], box[2])
             photograph = WindowPhotograph(
                 torch.from_numpy(scene.image(name, t)[part].copy()),
@@ -123,6 +144,7 @@ def collect_targets(
                 top=box[1] - y0,
                 left=box[0] - x0,
             )
+            background = torch.from_numpy(backgrounds[name])
             targets.append(
                 TrainingTarget(
                     frame=frame,
@@ -130,9 +152,11 @@ def collect_targets(
                     camera=camera.cropped(x0, y0, x1 - x0, y1 - y0),
                     eye=eye,
                     photograph=photograph,
-                    background=torch.from_numpy(backgrounds[name])[y0:y1, x0:x1],
-                    area=crop_area if silhouette_norm == "image" else float(mask.sum()),
+                    background=background if background.ndim == 1 else background[y0:y1, x0:x1],
+                    area=areas.get(silhouette_norm, float(mask.sum())),
                     hidden=None if hidden is None else torch.from_numpy(hidden(name, positions)),
+                    frozen=frozen.get(name),
+                    modes=_modes(camera, box) if name in frozen else None,
                 )
             )
     return targets

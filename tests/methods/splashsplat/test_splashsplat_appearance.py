@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from splashbench.render import freeze, rasterize_arrays
+from splashbench.scene import Camera
 from splashbench_methods.splashsplat.appearance import losses
-from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
+from splashbench_methods.splashsplat.appearance.decoder import Children, Decoder, DecoderSettings
+from splashbench_methods.splashsplat.appearance.fitting import composite
 from splashbench_methods.splashsplat.appearance.optimizer import RowAdam
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState
 
@@ -66,6 +69,44 @@ def test_colour_sees_the_viewing_direction_and_shape_does_not():
     assert not torch.allclose(front.colors, side.colors)
     assert torch.equal(front.means, side.means)
     assert torch.equal(front.factors, side.factors)
+
+
+def one_child(depth: float, color: tuple[float, float, float]) -> Children:
+    """A Gaussian of a carrier, .2 wide, nearly opaque, in front of a camera at the origin that looks along z."""
+    shape = (1, 1)
+    return Children(
+        torch.tensor([0.0, 0.0, depth]).expand(*shape, 3),
+        0.2 * torch.eye(3).expand(*shape, 3, 3),
+        torch.full(shape, 0.99),
+        torch.tensor(color).expand(*shape, 3),
+        torch.zeros(*shape, 3),
+    )
+
+
+def test_liquid_and_background_drawn_together_hide_each_other_by_depth():
+    """A red wall at depth 2, liquid in blue; black lies behind."""
+    camera = Camera("c", 40, 40, np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.eye(4))
+    wall = (
+        np.float32([[0, 0, 2]]),
+        0.5 * np.eye(3, dtype=np.float32)[None],
+        np.float32([0.99]),
+        np.float32([[1, 0, 0]]),
+    )
+    frozen, black = freeze(*wall, camera), torch.zeros(3)
+    before, behind = one_child(1.5, (0.0, 0.0, 1.0)), one_child(3.0, (0.0, 0.0, 1.0))
+    rgb, alpha = composite(before, camera, black, frozen)
+    assert rgb[20, 20, 2] > 0.9
+    assert rgb[20, 20, 0] < 0.1
+    hidden_rgb, hidden_alpha = composite(behind, camera, black, frozen)
+    assert hidden_rgb[20, 20, 2] < 0.1
+    assert hidden_rgb[20, 20, 0] > 0.9
+    # The paper's opacity is that of the liquid rasterised alone, hidden or not.
+    assert min(alpha[20, 20], hidden_alpha[20, 20]) > 0.9
+    assert alpha[0, 0] < 0.01
+    assert rgb[8, 20, 0] > 0.3  # the wall stands beside the liquid, too
+    # Over an image of the wall the liquid is in front, wherever it is.
+    wall_image = torch.from_numpy(rasterize_arrays(*wall, camera)[0])
+    assert composite(behind, camera, wall_image)[0][20, 20, 2] > 0.9
 
 
 def images() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -11,9 +11,11 @@ import pytest
 import torch
 
 from splashbench.harness.contract import Run
+from splashbench.render import rasterize_arrays
 from splashbench.scene import Scene
 from splashbench.synth.balls import ball_centers, write_balls_scene
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat.appearance.targets import collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import locate
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.motion.velocity import control_shape
@@ -77,6 +79,34 @@ np.savez({str(tmp_path / "views.npz")!r}, rgb=[v.rgb for v in views], alpha=[v.a
         np.testing.assert_array_equal(views["alpha"][i], here.alpha)
     assert (tmp_path / "static").is_dir()
     assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} <= {".json", ".npz"}
+
+
+def test_drawn_together_with_the_background_it_is_saved_and_loaded_too(balls: Scene, tmp_path: Path):
+    """As in the preset paper: one rasterisation of all Gaussians, in the fit and in what it renders."""
+    settings = TINY | {"iterations": 60, "composition": "together", "silhouette_norm": "image", "children": 2}
+    config = SplashSplatConfig.preset("quick", settings | {"control_grid": "sides"})
+    together = SplashSplat().fit(balls.training(), config, Run(seed=1))
+    together.save(tmp_path)
+    loaded = SplashSplat().load(tmp_path, balls.training())
+    camera, time = balls.cameras[balls.test[0]], float(balls.times[3])
+    first, second = together.render(camera, time), loaded.render(camera, time)
+    np.testing.assert_array_equal(first.rgb, second.rgb)
+    np.testing.assert_array_equal(first.alpha, second.alpha)
+    mask, truth = balls.mask(camera.name, 3), balls.image(camera.name, 3) / 255
+    error = ((first.rgb - truth)[mask] ** 2).mean()
+    assert error < 0.5 * ((together.background.render(camera) - truth)[mask] ** 2).mean()
+    assert (first.alpha > 0.5)[mask].mean() > 0.6
+    # The liquid's opacity is of the liquid alone, the image of all Gaussians in one order of depth.
+    children = together.children(camera, time)
+    assert children is not None
+    values = (children.means, children.factors, children.opacities, children.colors)
+    shapes = [value.detach().flatten(0, 1).numpy() for value in values]
+    _, alone = rasterize_arrays(*shapes, camera)
+    np.testing.assert_array_equal(first.alpha, alone.clip(0, 1))
+    background = together.background.gaussians(camera)
+    everything = [np.concatenate([ours, theirs]) for ours, theirs in zip(shapes, background)]
+    rgb, _ = rasterize_arrays(*everything, camera, background=together.background.far_color)
+    np.testing.assert_array_equal(first.rgb, rgb.clip(0, 1))
 
 
 def test_particles_are_the_carriers_near_the_balls(balls: Scene, fitted: FittedSplashSplat):
@@ -164,6 +194,20 @@ def test_times_are_located_on_uneven_steps(time, frame, fraction):
     assert locate(np.array([0.0, 1.0, 3.0]), time) == (frame, pytest.approx(fraction))
 
 
+def test_the_silhouette_term_averages_over_image_window_or_mask(balls: Scene):
+    liquid = liquid_only(balls)
+    training = balls.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+    image, window, mask = (collect_targets(training, grey, liquid.track, norm) for norm in ("image", "window", "mask"))
+    assert len(image) == len(window) == len(mask) > 10
+    for whole, part, wet in zip(image, window, mask):
+        # The paper: |Omega| pixels, and nothing that a Gaussian does in the image goes unseen.
+        assert whole.area == whole.camera.width * whole.camera.height
+        assert (whole.camera.width, whole.camera.height) == (training.cameras["1"].width, training.cameras["1"].height)
+        assert wet.area == float(wet.photograph.mask.sum()) < part.area < whole.area
+        assert part.camera.width * part.camera.height < whole.area
+
+
 def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(tmp_path: Path):
     """Three of five cameras expose up to half a step early or late; the test views are in time."""
     n_frames = 6
@@ -237,4 +281,5 @@ def test_the_paper_preset_is_the_papers():
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
     assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)
+    assert (paper.silhouette_norm, paper.composition) == ("image", "together")
     assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)
