@@ -14,7 +14,7 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from splashbench.harness.contract import MethodConfig
 from splashbench.observe.signed_distance import SignedDistanceMethod
 
-from .appearance.decoder import DecoderSettings
+from .appearance.decoder import DecoderSettings, ScaleResidual
 from .appearance.fitting import Composition, FitSettings
 from .appearance.losses import LossWeights
 from .appearance.targets import SilhouetteNorm
@@ -88,6 +88,8 @@ class SplashSplatConfig(MethodConfig):
     #: Gaussians of a carrier
     children: int = Field(1, ge=1, le=6)
     base_scale: PositiveFloat = 0.35
+    #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
+    scale_residual: ScaleResidual = "bounded"
     # Optimisation
     iterations: int = Field(4000, ge=0)
     learning_rate_features: PositiveFloat = 0.06
@@ -149,7 +151,7 @@ class SplashSplatConfig(MethodConfig):
             "shell_depth": 3.0,
             "max_per_cell": 5,
             "children": 2,
-            "base_scale": 0.7,
+            "scale_residual": "linear",
             "iterations": 3000,
             "learning_rate_features": 2e-3,
             "learning_rate_heads": 2e-3,
@@ -240,7 +242,9 @@ class SplashSplatConfig(MethodConfig):
 
     @property
     def decoder(self) -> DecoderSettings:
-        return DecoderSettings(feature_size=self.feature_size, children=self.children)
+        return DecoderSettings(
+            feature_size=self.feature_size, children=self.children, scale_residual=self.scale_residual
+        )
 
     @property
     def optimisation(self) -> FitSettings:

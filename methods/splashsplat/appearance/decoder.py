@@ -3,13 +3,14 @@
 Heads shared by all carriers and frames turn a carrier's feature f into K children in its frame A = F diag(s). Offset,
 scale and opacity come from linear heads, colour from a two-layer perceptron that also sees the viewing direction.
 `Decoder.forward` is the definition, in plain torch; `Decoder.decode` computes the same, on the CPU by the kernel of
-splashbench_methods.splashsplat.kernel.decode.
+splashbench_methods.splashsplat.kernel.decode, which has the bounded scale residual alone.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +25,10 @@ _START_DIRECTIONS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0
 _START_DISTANCE = 0.5
 
 
+#: r of the scales s exp(eta_s r): the head's answer, "linear" as in the paper, or "bounded" to within 2 and -2
+ScaleResidual = Literal["bounded", "linear"]
+
+
 @dataclass(frozen=True)
 class DecoderSettings:
     """offset_bound is beta, scale_range eta_s, opacity_slope kappa_alpha, opacity_band tau_alpha (transport voxels)."""
@@ -36,6 +41,7 @@ class DecoderSettings:
     opacity_slope: float = 2.0
     opacity_band: float = 3.0
     opacity_bias: float = 1.0
+    scale_residual: ScaleResidual = "bounded"
 
 
 @dataclass
@@ -117,9 +123,11 @@ class Decoder(nn.Module):
         offsets = self.offsets(features)
         local = (base[:, None] * offsets).transpose(1, 2)  # diag(s) o, [n, 3, K]
         means = state.positions[:, None] + torch.bmm(state.deformation, local).transpose(1, 2)
-        # Sigma = B B^T with B = F diag(g) / sqrt(K). The residual is bounded: an unbounded exponent lets single
-        # Gaussians grow over the whole image.
-        residual = 2 * torch.tanh(0.5 * self.scale(features).view(n, k, 3))
+        # Sigma = B B^T with B = F diag(g) / sqrt(K). An unbounded exponent may let single Gaussians grow over the whole
+        # image.
+        residual = self.scale(features).view(n, k, 3)
+        if s.scale_residual == "bounded":
+            residual = 2 * torch.tanh(0.5 * residual)
         extent = base[:, None] * torch.exp(s.scale_range * residual) / math.sqrt(k)
         factors = state.deformation[:, None] * extent[:, :, None, :]
         fade = torch.sigmoid(s.opacity_slope * (s.opacity_band - state.phi.abs()))
@@ -143,7 +151,8 @@ class Decoder(nn.Module):
         """Children of the carriers `rows` (int64 [n], ascending; None for all) of the tables, as `forward` has them,
         and with `cells` also the penalties on them. With `rows` the gradients of the tables are sparse."""
         tables = (features, log_scales)
-        if all(table.device.type == "cpu" and table.dtype == torch.float32 for table in tables):
+        compiled = self.settings.scale_residual == "bounded"
+        if compiled and all(table.device.type == "cpu" and table.dtype == torch.float32 for table in tables):
             groups = () if cells is None else (cells.of_carriers, len(cells.sizes))
             instant = Instant(state.positions, state.deformation, state.phi, eye, state.visibility, *groups)
             *children, terms = decode(self.heads(), *tables, instant, rows)

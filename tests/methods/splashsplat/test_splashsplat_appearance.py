@@ -53,6 +53,20 @@ def test_covariance_follows_deformation_and_scale():
     np.testing.assert_allclose((got @ got.T).detach(), (B @ B.T).detach(), rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.parametrize("answer", [0.6, 5.0])
+def test_the_scales_residual_may_be_the_heads_answer_itself(answer: float):
+    """Eq. child_position: B = A diag(exp(eta_s g_s(f))) / sqrt(K), whatever g_s answers."""
+    decoder = decoder_with_constant_heads(scale_residual="linear")
+    with torch.no_grad():
+        decoder.scale.bias.copy_(torch.tensor([answer, 0, 0, 0, 0, 0]))
+    arguments = torch.zeros(1, 4), torch.zeros(1, 3)
+    children = decoder(*arguments, state(torch.eye(3)), torch.zeros(3))
+    assert float(children.factors[0, 0, 0, 0].detach()) == pytest.approx(math.exp(0.5 * answer) / math.sqrt(2))
+    compiled, _ = decoder.decode(*arguments, None, state(torch.eye(3)), torch.zeros(3))
+    assert torch.equal(compiled.factors, children.factors)
+    assert compiled.factors.requires_grad
+
+
 def test_opacity_fades_away_from_the_interface():
     decoder = decoder_with_constant_heads()
     for phi in (0.0, 3.0, -6.0):

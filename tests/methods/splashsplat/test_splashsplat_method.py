@@ -84,7 +84,7 @@ np.savez({str(tmp_path / "views.npz")!r}, rgb=[v.rgb for v in views], alpha=[v.a
 def test_drawn_together_with_the_background_it_is_saved_and_loaded_too(balls: Scene, tmp_path: Path):
     """As in the preset paper: one rasterisation of all Gaussians, in the fit and in what it renders."""
     settings = TINY | {"iterations": 60, "composition": "together", "silhouette_norm": "image", "children": 2}
-    config = SplashSplatConfig.preset("quick", settings | {"control_grid": "sides"})
+    config = SplashSplatConfig.preset("quick", settings | {"scale_residual": "linear", "control_grid": "sides"})
     together = SplashSplat().fit(balls.training(), config, Run(seed=1))
     together.save(tmp_path)
     loaded = SplashSplat().load(tmp_path, balls.training())
@@ -280,6 +280,8 @@ def test_the_paper_preset_is_the_papers():
     assert (velocity.smooth, velocity.smoothing, velocity.smoothing_unit) == ("field", 0.6, "transport")
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
-    assert (paper.decoder.feature_size, paper.decoder.children) == (32, 2)
+    assert (paper.decoder.feature_size, paper.decoder.children, paper.decoder.scale_residual) == (32, 2, "linear")
     assert (paper.silhouette_norm, paper.composition) == ("image", "together")
+    # What the paper does not say is the same in every preset.
+    assert paper.base_scale == SplashSplatConfig().base_scale
     assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)
