@@ -56,7 +56,7 @@ class Deformable3DGS(Method):
 
     id: ClassVar[str] = "deformable_3dgs"
     title: ClassVar[str] = "Deformable-3DGS"
-    version: ClassVar[str] = "3"  # since `quick` has fewer Gaussians, more steps and slower places
+    version: ClassVar[str] = "4"  # since the times' noise of `paper` is the official code's
     Config: ClassVar[type[MethodConfig]] = DeformableSettings
     mixed: ClassVar[bool] = True
 
@@ -69,19 +69,20 @@ class Deformable3DGS(Method):
             extent = camera_extent(scene)
             turned = ("deformation.layers",) if config.network_steps == "muon" else ()
             optimizer = RowOptimizer(model, rates(config, extent), ROWS, config.iterations, orthogonal=turned)
+            photographs = Photographs(scene, config.longest_side, config.views_per_step, rng)
             noise = _TimeNoise(config, scene.n_frames, rng)
 
             def begin_step(step: int) -> float:
                 model.deforms = step >= config.warm_up * config.iterations
                 model.active_degree = min(config.sh_degree, step // config.sh_every)
-                return noise.at(step)
+                return noise.at(step, photographs.left)
 
             with run.stage("fit"):
                 history = fit_dynamic(
                     model,
                     optimizer,
                     DensityControl(optimizer, config.density(extent)),
-                    Photographs(scene, config.longest_side, config.views_per_step, rng),
+                    photographs,
                     lambda done: run.progress(done, f"fitting {len(model.positions)} Gaussians"),
                     begin_step,
                 )
@@ -100,13 +101,21 @@ class Deformable3DGS(Method):
 
 
 class _TimeNoise:
-    """Annealed smoothing of the time (Yang et al. 2024, Eq. 6): Gaussian noise that falls to nothing."""
+    """Annealed smoothing of the time (Yang et al. 2024, Eq. 6): Gaussian noise that falls to nothing.
+
+    Its standard deviation is beta dt (1 - step / until), the recording lasting 1. The paper's dt is "the mean time
+    interval"; in the official code it is one by the photographs left of the round, so that the last ones of a round
+    are blurred most.
+    """
 
     def __init__(self, config: DeformableSettings, n_frames: int, rng: np.random.Generator) -> None:
+        self._config, self._n_frames, self._rng = config, n_frames, rng
         self._until = config.time_noise_until * config.iterations
-        self._sigma = config.time_noise / (n_frames - 1) if n_frames > 1 else 0.0
-        self._rng = rng
 
-    def at(self, step: int) -> float:
+    def at(self, step: int, left: int) -> float:
+        """What to add to the time of the next photograph; left: photographs to come in this round, this one too."""
         remaining = max(0.0, 1 - step / self._until)
-        return float(self._rng.normal()) * self._sigma * remaining
+        if self._n_frames < 2:
+            return 0.0
+        frames = self._n_frames - 1 if self._config.time_noise_unit == "timestep" else left
+        return float(self._rng.normal()) * (self._config.time_noise / frames) * remaining

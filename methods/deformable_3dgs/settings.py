@@ -17,6 +17,8 @@ class DeformableSettings(SplattingSettings):
         warm_up: share of the iterations in which the network does not take part yet.
         time_noise: standard deviation of the noise on a step's time at the start, in frames; it falls to 0 over
             the share `time_noise_until`.
+        time_noise_unit: the frame that `time_noise` is in: the duration of a "timestep", or as in the official code
+            that of the recording by the "photographs" that have not come yet in this round.
         depth, width: of the network.
         network_factor: times the published learning rate of the network. head_factor: times that, the rate of the heads
             for shifts and turns, growth_factor, of the head for growths; as published, 1.
@@ -32,16 +34,17 @@ class DeformableSettings(SplattingSettings):
             "growth_factor": 0.003, "network_steps": "muon",
         },
         "paper": {
-            "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "time_noise_until": 1.0, "depth": 8,
-            "width": 256, "sh_degree": 3, "sh_every": 1000, "static": "points", "static_points": 100_000,
-            "hull_points": 100_000, "start_opacity": 0.1, "max_gaussians": 500_000, "grow_from": 0.025,
-            "grow_until": 0.75, "prune_until": 0.75, "reset_every": 3000, "reset_until": 0.75, "rates": "published",
-            "longest_side": 16384,
+            "iterations": 20_000, "views_per_step": 1, "warm_up": 0.15, "time_noise_until": 1.0,
+            "time_noise_unit": "photographs", "depth": 8, "width": 256, "sh_degree": 3, "sh_every": 1000,
+            "static": "points", "static_points": 100_000, "hull_points": 100_000, "start_opacity": 0.1,
+            "max_gaussians": 500_000, "grow_from": 0.025, "grow_until": 0.75, "prune_until": 0.75,
+            "reset_every": 3000, "reset_until": 0.75, "rates": "published", "longest_side": 16384,
         },
     }  # fmt: skip
 
     warm_up: float = Field(default=0.1, ge=0, le=1)
     time_noise: float = Field(default=0.1, ge=0, le=10)
+    time_noise_unit: Literal["timestep", "photographs"] = "timestep"
     time_noise_until: float = Field(default=0.5, gt=0, le=1)
     depth: int = Field(default=8, ge=2, le=32)
     width: int = Field(default=96, ge=4, le=1024)

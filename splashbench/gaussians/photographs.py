@@ -46,6 +46,11 @@ class Photographs:
         self._kept_bytes = 0
         self._queue: list[list[tuple[str, int]]] = []
 
+    @property
+    def left(self) -> int:
+        """Photographs that have not come yet in this round, those of the next step among them; never 0."""
+        return sum(map(len, self._queue)) or len(self)
+
     def __len__(self) -> int:
         return len(self._cameras) * self._scene.n_frames
 

@@ -11,12 +11,13 @@ import torch
 
 from splashbench.gaussians.initialization import StartingPoints
 from splashbench.gaussians.mixed_model import MixedFitted
+from splashbench.gaussians.photographs import Photographs
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench_methods.deformable_3dgs import Deformable3DGS
 from splashbench_methods.deformable_3dgs.deformation import Deformation, encode
-from splashbench_methods.deformable_3dgs.method import rates
+from splashbench_methods.deformable_3dgs.method import _TimeNoise, rates
 from splashbench_methods.deformable_3dgs.model import DeformableModel
 from splashbench_methods.deformable_3dgs.settings import DeformableSettings
 
@@ -100,6 +101,34 @@ def test_published_rates_fall_by_steps_so_that_fits_of_real_scenes_end_before_th
     found = rates(DeformableSettings.preset("paper", {"iterations": steps}), 5.0)
     assert found["positions"].at(1.0) == pytest.approx(positions)
     assert found["deformation.layers"].at(1.0) == pytest.approx(network)
+
+
+def test_the_times_noise_of_the_preset_paper_is_the_official_codes(balls: Scene) -> None:
+    """0.1 of the recording by the photographs left of the round, falling along a line until step 20 000."""
+    paper = DeformableSettings.preset("paper", {})
+    assert isinstance(paper, DeformableSettings)
+
+    def deviation(config: DeformableSettings, step: int, left: int) -> float:
+        noise = _TimeNoise(config, 50, np.random.default_rng(0))
+        return float(np.std([noise.at(step, left) for _ in range(4000)]))
+
+    assert deviation(paper, 0, 250) == pytest.approx(0.1 / 250, rel=0.05)
+    assert deviation(paper, 5000, 10) == pytest.approx(0.75 * 0.1 / 10, rel=0.05)
+    assert deviation(paper, 20_000, 1) == 0
+    # A fit on two cores takes 0.1 of a timestep, whatever is left of the round.
+    quick = DeformableSettings.preset("quick", {})
+    assert isinstance(quick, DeformableSettings)
+    assert deviation(quick, 0, 250) == deviation(quick, 0, 1) == pytest.approx(0.1 / 49, rel=0.05)
+    photographs = Photographs(balls.training(), 32, 2, np.random.default_rng(0))
+    views, frames = len(balls.train), balls.n_frames
+    left = []
+    for _ in range(3 * frames):
+        left.append(photographs.left)
+        photographs.next()
+    assert left[0] == views * frames
+    assert min(left) > 0
+    assert sorted(set(left), reverse=True) == left
+    assert photographs.left == views * frames  # the next round
 
 
 def test_positions_get_no_gradient_through_the_network() -> None:
