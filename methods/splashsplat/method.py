@@ -22,6 +22,7 @@ from .appearance.fitting import composite
 from .carriers.between import carriers_at
 from .carriers.subframe import CarrierState
 from .fields.occlusion import LiquidOcclusion
+from .flip.solver import metric_gravity
 from .model import Liquid
 from .reconstruction import fit_liquid
 from .settings import VERSION, SplashSplatConfig
@@ -131,6 +132,8 @@ class SplashSplat(Method):
         """Background, observation fields, carriers, appearance, in that order."""
         from ..scaffold_gs import shared_background
 
+        if config.variant == "flip":
+            metric_gravity(scene)  # an error now rather than after the background
         with run.stage("background"), one_torch_thread():
             background = shared_background(scene, config.background, run, span=(0, _BACKGROUND))
         frozen: dict[str, Frozen] | None = None

@@ -69,6 +69,8 @@ class SplashSplatConfig(MethodConfig):
     projection_blend: float = Field(0.35, ge=0, le=1)
     velocity_limit: PositiveFloat = 8.0
     # Carriers
+    #: "full", or one of the paper's ablations "no_resampling", "per_frame" and "flip"; the last needs gravity, the
+    #: metric scale and the frames' times in scene.json
     variant: TrackingVariant = "full"
     correction: PositiveFloat = 1.0
     kill_outside: PositiveFloat = 0.5

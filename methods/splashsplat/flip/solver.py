@@ -2,9 +2,10 @@
 "One-FrameStep Solver Comparison").
 
 A FLIP/PIC solver (Zhu and Bridson 2005) with gravity, the container's walls and a free surface, and nothing that the
-images do not show: no inflow, no viscosity, no surface tension. A step is kick, drift, kick: half of gravity and a
-projection before the particles move and half after, which makes free fall exact. Lengths are voxels of the transport
-grid, velocities voxels per second.
+images do not show: no inflow, no viscosity, no surface tension. It needs the scene's gravity, its metric scale and the
+frames' true times, as the paper's does ("gravity in the metric scale of the capture"). A step is kick, drift, kick:
+half of gravity and a projection before the particles move and half after, which makes free fall exact. Lengths are
+voxels of the transport grid, velocities voxels per second.
 """
 
 from __future__ import annotations
@@ -203,17 +204,28 @@ def _normals(solid: np.ndarray, points: np.ndarray) -> np.ndarray:
     return gradient / np.maximum(length, 1e-9)
 
 
-def gravity_in_voxels(scene: Scene | TrainingScene, grid: Grid) -> np.ndarray:
-    """Gravity in voxels of `grid` per second squared, float64 [3].
+def metric_gravity(scene: Scene | TrainingScene) -> np.ndarray:
+    """Gravity in scene units per second squared, float64 [3].
 
-    Raises SplashbenchError where it, or the frames' times, are unknown.
+    Raises SplashbenchError where gravity, the metric scale or the frames' times are unknown.
     """
-    if scene.gravity is None or scene.metres_per_unit is None or scene.times_source == "nominal":
-        missing = next((name for name in ("gravity", "metres_per_unit") if getattr(scene, name) is None), "times")
+    facts = {
+        "gravity": scene.gravity,
+        "metres_per_unit": scene.metres_per_unit,
+        "times": None if scene.times_source == "nominal" else scene.times_source,
+    }
+    missing = [name for name, value in facts.items() if value is None]
+    if scene.gravity is None or scene.metres_per_unit is None or missing:
         raise SplashbenchError(
-            f"scene {scene.name}: FLIP needs {missing}, which the scene does not tell; add it to scene.json"
+            f"scene {scene.name}: FLIP needs {' and '.join(missing)}, which the scene does not tell; add it to "
+            "scene.json (`splashbench scene place-container` finds gravity and scale where the container has a mesh)"
         )
-    return np.asarray(scene.gravity, dtype=np.float64) * STANDARD_GRAVITY / scene.metres_per_unit / grid.voxel
+    return np.asarray(scene.gravity, dtype=np.float64) * STANDARD_GRAVITY / scene.metres_per_unit
+
+
+def gravity_in_voxels(scene: Scene | TrainingScene, grid: Grid) -> np.ndarray:
+    """Gravity in voxels of `grid` per second squared, float64 [3]; see `metric_gravity`."""
+    return metric_gravity(scene) / grid.voxel
 
 
 class FlipTransport:

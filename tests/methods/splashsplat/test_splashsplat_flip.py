@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from splashbench import parallel
 from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Run
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
+from splashbench.scene import Scene
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.flip.solver import (
     FlipSettings,
     FlipSolver,
@@ -247,5 +253,16 @@ def test_gravity_needs_scale_direction_and_times():
     with pytest.raises(SplashbenchError, match=r"known: FLIP needs metres_per_unit.*scene\.json"):
         gravity_in_voxels(Known(), grid)
     Known.gravity = None
-    with pytest.raises(SplashbenchError, match="FLIP needs gravity"):
+    with pytest.raises(SplashbenchError, match=r"needs gravity and metres_per_unit and times.*scene place-container"):
         gravity_in_voxels(Known(), grid)
+
+
+def test_what_flip_lacks_is_said_before_the_background_is_fitted(balls_copy: Path):
+    meta = json.loads((balls_copy / "scene.json").read_text())
+    (balls_copy / "scene.json").write_text(json.dumps(meta | {"gravity": None}))
+    run = Run(seed=0)
+    with pytest.raises(SplashbenchError, match="FLIP needs gravity"):
+        SplashSplat().fit(
+            Scene.open(balls_copy).training(), SplashSplatConfig.preset("quick", {"variant": "flip"}), run
+        )
+    assert run.stages == {}
