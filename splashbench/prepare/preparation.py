@@ -113,6 +113,13 @@ class Preparation:
                 "end_s": self.motion.end,
                 "reasons": list(self.motion.reasons),
             },
+            "sequence_sync": {
+                "clock_rms_s": self.sequence.clock_rms_s,
+                "whole_frame_rms_s": self.sequence.whole_frame_rms_s,
+                "definition": "RMS over cameras of the offsets in the motion interval: along the fitted clocks, and as"
+                " the paper's Sync RMS after one shift by whole frames per camera",
+                "unmeasured": list(self.sequence.unmeasured),
+            },
             "sampling": {
                 "times": self.sampling.times.tolist(),
                 "nominal": self.sampling.nominal.tolist(),

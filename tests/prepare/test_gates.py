@@ -73,12 +73,16 @@ def clock(residual: float, status: str = "ok") -> ClockFit:
 
 def test_sync_gates_name_the_worst_camera_and_those_not_measured() -> None:
     clocks = {"1": clock(0.0), "2": clock(0.002), "3": clock(0.0005)}
-    found = {gate.name: gate for gate in sync_gates(clocks, SequenceSync(0.009, {"1": 0.0, "2": 0.0}, ("3",)))}
+    found = {gate.name: gate for gate in sync_gates(clocks, SequenceSync(0.009, {"1": 0.0, "2": 0.0}, ("3",), 0.0123))}
     assert found["cameras_synchronised"].passed
     assert not found["clock_residual"].passed
     assert "camera 2" in found["clock_residual"].detail
     assert not found["sequence_sync"].passed  # 9 ms are more than half a frame
-    assert "3" in found["sequence_sync"].detail
+    assert found["sequence_sync"].value == 0.009
+    detail = found["sequence_sync"].detail
+    assert detail.startswith("s RMS about the fitted clocks")
+    assert "12.3 ms after whole-frame shifts, the paper's Sync RMS" in detail
+    assert "3" in detail
     lost = sync_gates(clocks | {"3": clock(float("nan"), "silent")}, None)
     assert [gate.passed for gate in lost if gate.essential] == [False]
 

@@ -65,6 +65,7 @@ RESULTS = [
     (dict[str, ClockFit], {"1": CLOCK, "2": FLAGGED}),
     (SyncResult, SyncResult({"1": CLOCK}, {"1": ()}, {})),
     (SequenceSync, SequenceSync(None, {}, ("2", "3"))),
+    (SequenceSync, SequenceSync(0.001, {"1": 0.0, "2": 0.0}, (), 0.005)),
     (MotionInterval, MotionInterval(0.1, 2.7, ("given",), {"1": (0.1, 2.7)})),
     (
         Sampling,
@@ -168,7 +169,7 @@ def test_a_result_that_cannot_be_read_is_made_anew(store: StageStore) -> None:
     others = [json.dumps({**whole, **change}) for change in ({"result": {"rms_s": "x"}}, {"key": "0"})]
     for text in ("", "{", "[]", "[" * 100_000, *others):
         path.write_text(text)
-        assert store.result("sync", SequenceSync, {}, lambda: SequenceSync(0.2, {}, ())).rms_s == 0.2
+        assert store.result("sync", SequenceSync, {}, lambda: SequenceSync(0.2, {}, ())).clock_rms_s == 0.2
 
 
 def test_files_without_their_result_are_rubbish(store: StageStore) -> None:

@@ -55,13 +55,14 @@ def sequence_sync(
     interval: tuple[float, float],
     reference: str,
 ) -> SequenceSync:
-    """The paper's residual synchronisation error within `interval` (seconds, reference clock)."""
+    """What the clocks leave over within `interval` (seconds, reference clock), and the paper's residual error there."""
+    frame_s = 1 / pour.recordings[reference].info.fps
 
     def measure() -> SequenceSync:
         audio = {name: recording.audio(AUDIO_RATE) for name, recording in pour.recordings.items()}
-        return sync.sequence_sync_rms(audio, AUDIO_RATE, clocks, interval, reference)
+        return sync.sequence_sync_rms(audio, AUDIO_RATE, clocks, interval, reference, frame_s=frame_s)
 
-    inputs = {"files": pour.all_files, "clocks": clocks, "interval": interval}
+    inputs = {"files": pour.all_files, "clocks": clocks, "interval": interval, "frame_s": frame_s}
     return store.result("motion", SequenceSync, inputs, measure, part="sequence_sync")
 
 

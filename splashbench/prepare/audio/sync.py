@@ -73,17 +73,20 @@ class ClockFit:
 
 @dataclass(frozen=True)
 class SequenceSync:
-    """Residual synchronisation of one sequence: the paper's Sync RMS and the offsets it is made of.
+    """Residual synchronisation of one sequence: what is left over along the fitted clocks, and the paper's Sync RMS.
 
     Attributes:
-        rms_s: over the measured cameras; None where fewer than two are.
-        offsets_s: camera -> residual offset, less their mean.
+        clock_rms_s: RMS of the offsets from the fitted clocks over the measured cameras; None where fewer than two are.
+        offsets_s: camera -> residual offset from its fitted clock, less their mean.
         unmeasured: cameras whose sound within the sequence tells nothing (the paper's dagger).
+        whole_frame_rms_s: the paper's Sync RMS: the same, had each camera been shifted by whole frames, once for the
+            whole recording, in place of the fitted clocks. It holds the rounding and the clocks' drift.
     """
 
-    rms_s: float | None
+    clock_rms_s: float | None
     offsets_s: dict[str, float]
     unmeasured: tuple[str, ...]
+    whole_frame_rms_s: float | None = None
 
 
 def estimate_sync(
@@ -251,14 +254,16 @@ def sequence_sync_rms(
     interval: tuple[float, float],
     reference: str,
     margin_s: float = 0.0,
+    frame_s: float = 1 / 60,
 ) -> SequenceSync:
-    """The paper's Sync RMS: offsets re-estimated by GCC-PHAT within the sequence, centred, RMS over cameras.
+    """Offsets re-estimated by GCC-PHAT within the sequence, centred, and their RMS over cameras.
 
     `interval`: seconds on the reference's clock, widened by `margin_s` at both ends. The frames were chosen by `fits`;
-    the offsets here are what those leave over, up to 50 ms.
+    the offsets here are what those leave over, up to 50 ms. The paper instead shifts a camera by whole frames of
+    `frame_s` seconds, once for the session (supplement, "Capture Setup"): its Sync RMS is the other figure.
     """
     x, x_start = audio[reference]
-    offsets = {reference: 0.0}
+    offsets, whole_frame = {reference: 0.0}, {reference: 0.0}
     unmeasured = []
     for camera, (y, y_start) in audio.items():
         if camera == reference:
@@ -275,12 +280,27 @@ def sequence_sync_rms(
             # Sound that arrives later by the reference's clock than the fit says: the fit put the camera too
             # early.
             offsets[camera] = window.delay_s - (line[0] + (line[1] - 1) * window.time_s)
+            at = y_start + window.time_s
+            by_clock = float(fit.to_reference(at)) - at
+            whole_frame[camera] = by_clock + offsets[camera] - _session_shift(fit, y_start, len(y) / rate, frame_s)
     if len(offsets) < 2:
         return SequenceSync(None, {}, tuple(unmeasured))
+    centred, rms = _centred(offsets)
+    return SequenceSync(rms, centred, tuple(unmeasured), _centred(whole_frame)[1])
+
+
+def _session_shift(fit: ClockFit, start_s: float, duration_s: float, frame_s: float) -> float:
+    """Whole frames, in seconds, by which a camera is shifted that recorded `duration_s` from `start_s` on (its clock):
+    those nearest to its mean offset."""
+    middle = start_s + 0.5 * duration_s
+    return round((float(fit.to_reference(middle)) - middle) / frame_s) * frame_s
+
+
+def _centred(offsets: Mapping[str, float]) -> tuple[dict[str, float], float]:
+    """`offsets` less their mean, and their RMS then."""
     mean = float(np.mean(list(offsets.values())))
     centred = {camera: offset - mean for camera, offset in offsets.items()}
-    rms = float(np.sqrt(np.mean(np.square(list(centred.values())))))
-    return SequenceSync(rms, centred, tuple(unmeasured))
+    return centred, float(np.sqrt(np.mean(np.square(list(centred.values())))))
 
 
 def sound_paths(

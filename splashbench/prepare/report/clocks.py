@@ -33,10 +33,10 @@ def clocks_section(preparation: Preparation) -> list[str]:
         "residual in the sequence [ms]",
     ]
     note = (
-        "Reference time = start + (1 + drift) x local time. Residual in the sequence: the offset measured again within"
-        " the motion interval, less the mean over cameras. Below: every window of sound that a clock was fitted to, by"
-        " its delay from the clock's line. The scatter shows how well single windows agree; a bend would be a clock"
-        " whose rate changed."
+        "Reference time = start + (1 + drift) x local time. Residual in the sequence: the offset from that, measured"
+        f" again within the motion interval, less the mean over cameras{_both(preparation)}. Below: every window of"
+        " sound that a clock was fitted to, by its delay from the clock's line. The scatter shows how well single"
+        " windows agree; a bend would be a clock whose rate changed."
     )
     return [
         table(header, rows),
@@ -44,6 +44,17 @@ def clocks_section(preparation: Preparation) -> list[str]:
         *_windows(preparation),
         *_sound_paths(preparation),
     ]
+
+
+def _both(preparation: Preparation) -> str:
+    """The RMS of the residuals, and the paper's Sync RMS."""
+    sequence = preparation.sequence
+    if sequence.clock_rms_s is None or sequence.whole_frame_rms_s is None:
+        return ""
+    return (
+        f"; their RMS is {sequence.clock_rms_s * 1e3:.2f} ms. Had each camera been shifted once, by whole frames, it"
+        f" would be {sequence.whole_frame_rms_s * 1e3:.2f} ms: the paper's Sync RMS, which holds rounding and drift"
+    )
 
 
 def _windows(preparation: Preparation) -> list[str]:

@@ -225,8 +225,14 @@ def test_sequence_sync_rms_finds_what_the_fit_left_over() -> None:
     fits = estimate_sync(audio, RATE, "1")
     exact = sequence_sync_rms(audio, RATE, fits, (3.0, 6.5), "1")
     assert exact.unmeasured == ("4",)
-    assert exact.rms_s is not None
-    assert exact.rms_s < 20e-6
+    assert exact.clock_rms_s is not None
+    assert exact.clock_rms_s < 20e-6
+    # The paper shifts by whole frames of 1/60 s: 0.5 s are 30 of them, -0.3 s are 18, so nothing is rounded.
+    assert exact.whole_frame_rms_s == pytest.approx(exact.clock_rms_s, abs=20e-6)
+    # At 0.07 s a frame both are rounded: 0.5 to 0.49, and -0.3 to -0.28.
+    coarse = sequence_sync_rms(audio, RATE, fits, (3.0, 6.5), "1", frame_s=0.07)
+    assert coarse.clock_rms_s == exact.clock_rms_s
+    assert coarse.whole_frame_rms_s == pytest.approx(np.std([0.0, 0.01, -0.02]), abs=50e-6)
     # Whole-frame alignment of the paper: shift two cameras by known amounts, in both directions.
     shifted = dict(fits)
     shifted["2"] = replace(fits["2"], start_s=fits["2"].start_s - 6e-3)
@@ -235,15 +241,29 @@ def test_sequence_sync_rms_finds_what_the_fit_left_over() -> None:
     errors = np.array([0.0, 6e-3, -3e-3])
     centred = errors - errors.mean()
     np.testing.assert_allclose([found.offsets_s[name] for name in "123"], centred, atol=30e-6)
-    assert found.rms_s == pytest.approx(np.sqrt(np.mean(centred**2)), abs=20e-6)
+    assert found.clock_rms_s == pytest.approx(np.sqrt(np.mean(centred**2)), abs=20e-6)
 
 
 def test_sequence_sync_rms_of_silence_is_unknown() -> None:
     audio, _ = doubtful()
     fits = estimate_sync({name: audio[name] for name in ("good", "dead")}, RATE, "good")
     result = sequence_sync_rms({name: audio[name] for name in ("good", "dead")}, RATE, fits, (2.0, 4.0), "good")
-    assert result.rms_s is None
+    assert result.clock_rms_s is None
+    assert result.whole_frame_rms_s is None
     assert result.unmeasured == ("dead",)
+
+
+def test_the_papers_sync_rms_holds_the_drift_that_one_shift_leaves() -> None:
+    """A clock that is 150 us/s off: its mean offset of 1.5 ms rounds to no frame, and 2.6 ms stay at second 17.5."""
+    emitted = sources(21, 20, pour=(2, 19))
+    drift = 150e-6
+    tracks = record(emitted, 20, 0.0), record(emitted, 20, 0.0, clock_rate=1 + drift, seed=1)
+    audio: Audio = {"1": (tracks[0], 0.0), "2": (tracks[1], 0.0)}
+    fits = estimate_sync(audio, RATE, "1")
+    late = sequence_sync_rms(audio, RATE, fits, (16.0, 19.0), "1")
+    assert late.clock_rms_s is not None
+    assert late.clock_rms_s < 200e-6
+    assert late.whole_frame_rms_s == pytest.approx(drift * 17.5 / 2, rel=0.1)
 
 
 def test_sound_paths_are_taken_out_once_positions_are_known() -> None:
