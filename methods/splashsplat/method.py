@@ -62,7 +62,7 @@ class FittedSplashSplat(Fitted):
         """The Gaussians of the liquid as `camera` sees them at `time` (seconds); None where there is no liquid."""
         shown = [
             self._decoded(camera, ids, state)
-            for ids, state in carriers_at(self.liquid.track, self.liquid.times, time)
+            for ids, state in carriers_at(self.liquid.track, self.liquid.times, time, self.liquid.between_frames)
             if len(ids)
         ]
         if len(shown) < 2:

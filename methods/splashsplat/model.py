@@ -19,6 +19,7 @@ from splashbench.scene.particles import Particles
 
 from .appearance.decoder import Decoder, DecoderSettings
 from .appearance.fitting import Appearance, Composition
+from .carriers.between import BetweenFrames
 from .carriers.population import Carriers
 from .carriers.subframe import Track
 from .motion.fall import falls_of, table_of
@@ -60,6 +61,7 @@ class Liquid:
     times: [T] seconds. grid: the transport grid. carriers, motion: in the precision of the files. phi: int8 [T, nx, ny,
     nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers. composition: how it was
     fitted and is drawn: "over" an image of the background, or "together" with the background's Gaussians.
+    between_frames: whose carriers are drawn there, see carriers/between.py.
     """
 
     times: np.ndarray
@@ -70,6 +72,7 @@ class Liquid:
     appearance: Appearance
     carried: bool = True
     composition: Composition = "over"
+    between_frames: BetweenFrames = "both"
 
     @classmethod
     def of(
@@ -82,11 +85,12 @@ class Liquid:
         appearance: Appearance,
         carried: bool = True,
         composition: Composition = "over",
+        between_frames: BetweenFrames = "both",
     ) -> Liquid:
         """Bring the learned tables and the motion to the precision of the files."""
         halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
         appearance = Appearance(halves[0], halves[1], appearance.decoder)
-        return cls(times, grid, carriers, motion.half(), phi, appearance, carried, composition)
+        return cls(times, grid, carriers, motion.half(), phi, appearance, carried, composition, between_frames)
 
     @property
     def track(self) -> Track:
@@ -133,6 +137,7 @@ class Liquid:
             "carriers": self.carriers.count,
             "carried": self.carried,
             "composition": self.composition,
+            "between_frames": self.between_frames,
             "decoder": dict(vars(settings)),
         }
         write_json(directory / "liquid.json", header)
@@ -172,6 +177,7 @@ class Liquid:
             factor, count = _factor(header["factor"]), int(header["carriers"])
             carried = bool(header["carried"])
             # Models of before there was a choice do not say.
+            between: BetweenFrames = "forward" if header.get("between_frames") == "forward" else "both"
             composition: Composition = "together" if header.get("composition") == "together" else "over"
             decoder = Decoder(
                 DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})
@@ -213,4 +219,4 @@ class Liquid:
             torch.from_numpy(tables["log_scales"].astype(np.float32)),
             decoder,
         )
-        return cls(times, grid, carriers, motion, phi, appearance, carried, composition)
+        return cls(times, grid, carriers, motion, phi, appearance, carried, composition, between)

@@ -79,7 +79,17 @@ def fit_liquid(
     # What moves the carriers of the other variants is not u_t.
     carried = config.variant in ("full", "no_resampling")
     composition = config.composition if frozen is not None else "over"
-    liquid = Liquid.of(scene.times, observations.grid, carriers, motion, packed, appearance, carried, composition)
+    liquid = Liquid.of(
+        scene.times,
+        observations.grid,
+        carriers,
+        motion,
+        packed,
+        appearance,
+        carried,
+        composition,
+        config.between_frames,
+    )
     return liquid, observations.occlusion
 
 

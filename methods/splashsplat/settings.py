@@ -18,6 +18,7 @@ from .appearance.decoder import DecoderSettings, ScaleResidual
 from .appearance.fitting import Composition, FitSettings
 from .appearance.losses import LossWeights
 from .appearance.targets import SilhouetteNorm
+from .carriers.between import BetweenFrames
 from .carriers.resampling import ShellSettings
 from .carriers.tracking import CarrierSettings, TrackingVariant
 from .fields.observations import FieldSettings
@@ -107,6 +108,8 @@ class SplashSplatConfig(MethodConfig):
     ssim_every: PositiveInt = 1
     #: what the silhouette term is averaged over: the "image", the "window" around all masks of the view, or the "mask"
     silhouette_norm: SilhouetteNorm = "window"
+    #: between frames the carriers of "both" are shown, or those of the one before, moved "forward" as in the paper
+    between_frames: BetweenFrames = "both"
     #: the liquid is drawn "over" an image of the background, or "together" with the background's Gaussians, by depth
     composition: Composition = "over"
     foreground_weight: float = Field(0.5, ge=0)
@@ -162,6 +165,7 @@ class SplashSplatConfig(MethodConfig):
             "anneal": False,
             "silhouette_norm": "image",
             "composition": "together",
+            "between_frames": "forward",
             "validation_share": 0.0,
             "prune_opacity": 0.0,
             "background_preset": "paper",

@@ -1,4 +1,4 @@
-"""The liquid between two frames, shown by the carriers of both. Not in the paper, which shows those of the one before.
+"""The liquid between two frames, shown by the carriers of both. The paper shows those of the one before, see "forward".
 
 Each frame's carriers are moved to the time, forwards or backwards, and count by the nearness of their frame: at a
 frame's own time the other's are gone, so that nothing jumps. Three rules say which are moved and how opaque they are.
@@ -12,6 +12,8 @@ frame's own time the other's are gone, so that nothing jumps. Three rules say wh
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import torch
 from scipy.ndimage import uniform_filter
@@ -22,6 +24,9 @@ from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 from .subframe import CarrierState, Track, locate
 
+#: Which frames' carriers show what is between two of them: "both", or the one before, moved "forward".
+BetweenFrames = Literal["both", "forward"]
+
 # Side of the box, in transport voxels, in which two frames' liquid is compared, and the overlap from which it stands.
 _NEIGHBOURHOOD, _STEADY = 15, 0.7
 # Side of the cells, in transport voxels, that hold no carrier where there is a gap.
@@ -30,15 +35,21 @@ _GAP = 2.0
 _ASTRAY, _LOST = 1.0, 3.0
 
 
-def carriers_at(track: Track, times: np.ndarray, time: float) -> list[tuple[Tensor, CarrierState]]:
+def carriers_at(
+    track: Track, times: np.ndarray, time: float, shown: BetweenFrames = "both"
+) -> list[tuple[Tensor, CarrierState]]:
     """The carriers that show the liquid at `time` (seconds), the frames being at `times` [T]: numbers and states.
 
-    At a frame's time and outside the sequence these are the frame's own. Between frames some stand in the list twice.
+    At a frame's time and outside the sequence these are the frame's own. Between frames some stand in the list twice;
+    or, with `shown` "forward", those of the frame before are advected by u_t, and phi is interpolated between the two
+    observations (supplement, "Sub-frame decoding").
     """
     t, fraction = locate(times, time)
     if fraction == 0:
         return [(track.ids(t), track.state(t))]
     first, share = (t, fraction) if fraction > 0 else (t - 1, 1 + fraction)
+    if shown == "forward":
+        return [(track.ids(first), track.state(first, share))]
     overlap = steadiness(track.phi[first], track.phi[first + 1])
     return _of_frame(track, first, share, overlap) + _of_frame(track, first + 1, share - 1, overlap)
 

@@ -107,6 +107,24 @@ def test_a_frame_without_liquid_fades_into_the_next_one():
         assert all(float(state.visibility.max()) <= fraction for ids, state in parts if len(ids))
 
 
+@pytest.mark.parametrize("fraction", [0.3, 0.5, 0.9])
+def test_the_papers_way_is_forward_from_the_frame_before(fraction: float):
+    """x_t + tau u_t, and phi (1 - tau) phi_t + tau phi_{t+1} there, whichever frame is nearer."""
+    track = track_of(ball(40), ball(36), fall=4)
+    ((ids, state),) = carriers_at(track, TIMES, TIMES[0] + fraction * (TIMES[1] - TIMES[0]), "forward")
+    assert torch.equal(ids, track.ids(0))
+    expected = track.state(0).positions - torch.tensor([0.0, 0.0, 4 * fraction])
+    torch.testing.assert_close(state.positions, expected, atol=1e-3, rtol=0)
+    x = expected.numpy()
+    between = [np.linalg.norm(x - np.float32([12, 12, height]), axis=1) - 3 for height in (40, 36)]
+    phi = (1 - fraction) * between[0] + fraction * between[1]
+    # phi is interpolated between nodes, and its sixteenths of a voxel.
+    np.testing.assert_allclose(state.phi.numpy(), phi, atol=0.25)
+    assert state.visibility is None
+    ((late, state),) = carriers_at(track, TIMES, TIMES[1], "forward")
+    assert torch.equal(late, track.ids(1))
+
+
 def test_steady_is_what_keeps_its_place():
     rests, flies = (
         steadiness(*(np.clip(phi * STEPS_PER_VOXEL, -127, 127).astype(np.int8) for phi in pair))

@@ -84,7 +84,8 @@ np.savez({str(tmp_path / "views.npz")!r}, rgb=[v.rgb for v in views], alpha=[v.a
 def test_drawn_together_with_the_background_it_is_saved_and_loaded_too(balls: Scene, tmp_path: Path):
     """As in the preset paper: one rasterisation of all Gaussians, in the fit and in what it renders."""
     settings = TINY | {"iterations": 60, "composition": "together", "silhouette_norm": "image", "children": 2}
-    config = SplashSplatConfig.preset("quick", settings | {"scale_residual": "linear", "control_grid": "sides"})
+    settings |= {"scale_residual": "linear", "control_grid": "sides", "between_frames": "forward"}
+    config = SplashSplatConfig.preset("quick", settings)
     together = SplashSplat().fit(balls.training(), config, Run(seed=1))
     together.save(tmp_path)
     loaded = SplashSplat().load(tmp_path, balls.training())
@@ -92,6 +93,10 @@ def test_drawn_together_with_the_background_it_is_saved_and_loaded_too(balls: Sc
     first, second = together.render(camera, time), loaded.render(camera, time)
     np.testing.assert_array_equal(first.rgb, second.rgb)
     np.testing.assert_array_equal(first.alpha, second.alpha)
+    assert loaded.liquid.between_frames == "forward"
+    late = float(0.3 * balls.times[3] + 0.7 * balls.times[4])
+    np.testing.assert_array_equal(together.render(camera, late).rgb, loaded.render(camera, late).rgb)
+    assert len(together.children(camera, late).means) == len(together.children(camera, time).means)
     mask, truth = balls.mask(camera.name, 3), balls.image(camera.name, 3) / 255
     error = ((first.rgb - truth)[mask] ** 2).mean()
     assert error < 0.5 * ((together.background.render(camera) - truth)[mask] ** 2).mean()
@@ -281,7 +286,7 @@ def test_the_paper_preset_is_the_papers():
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
     assert (paper.decoder.feature_size, paper.decoder.children, paper.decoder.scale_residual) == (32, 2, "linear")
-    assert (paper.silhouette_norm, paper.composition) == ("image", "together")
+    assert (paper.silhouette_norm, paper.composition, paper.between_frames) == ("image", "together", "forward")
     # What the paper does not say is the same in every preset.
     assert paper.base_scale == SplashSplatConfig().base_scale
     assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)
