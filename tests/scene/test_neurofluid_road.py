@@ -12,6 +12,7 @@ from splashbench.cli.main import main
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench_methods.scaffold_gs import BackgroundSettings, fit_background
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig
 
 FEW_STEPS = ["--set", "iterations=10", "--set", "max_anchors=200", "--set", "longest_side=32"]
 
@@ -114,6 +115,20 @@ def test_the_background_of_the_preset_paper_starts_from_hull_points_and_is_white
     view = scene.test[0]
     image = background.render(scene.cameras[view])
     assert image[~scene.mask(view, 0)].mean() > 0.97
+
+
+def test_the_preset_paper_of_splashsplat_fits_a_scene_without_sparse_points(
+    watersphere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(BackgroundSettings.presets["paper"], "iterations", 30)  # type: ignore[index]
+    monkeypatch.setitem(BackgroundSettings.presets["paper"], "max_anchors", 300)  # type: ignore[index]
+    config = SplashSplatConfig.preset("paper", SMALL["splashsplat"] | {"iterations": 150})
+    scene = Scene.open(watersphere)
+    fitted = SplashSplat().fit(scene.training(), config, Run(seed=0))
+    view = scene.test[0]
+    render, mask = fitted.render(scene.cameras[view], float(scene.times[2])), scene.mask(view, 2)
+    assert render.rgb[~mask].mean() > 0.9
+    assert render.alpha[mask].mean() > 0.5 > 0.1 > render.alpha[~mask].mean()
 
 
 @pytest.mark.parametrize("method", ["splashsplat", "scaffold_4d"])
