@@ -37,7 +37,7 @@ class Scaffold4D(Method):
 
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
-    version: ClassVar[str] = "3"  # since `paper` starts and penalises as published
+    version: ClassVar[str] = "3"  # since it starts and penalises volumes as published
     Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
     mixed: ClassVar[bool] = True
 

@@ -40,7 +40,7 @@ class Scaffold4DSettings(DynamicFitSettings):
             "hull_points": 100_000, "children": 10, "max_anchors": 500_000, "fastest": 1.0, "base_color": False,
             # Published in steps: counted from 500, rounds after 1 500 and before 60 000.
             "count_from": 1 / 240, "grow_from": 0.0125, "grow_until": 0.49999, "rates": "published",
-            "spread_start": False, "volume_unit": "scene", "longest_side": 16384,
+            "longest_side": 16384,
         },
     }  # fmt: skip
 
@@ -53,8 +53,8 @@ class Scaffold4DSettings(DynamicFitSettings):
     voxel: float = Field(default=1.0, gt=0, le=100)
     prune_opacity: float = Field(default=0.005, ge=0, lt=1)
     count_from: float = Field(default=1.0, ge=0, le=1)
-    spread_start: bool = True
-    volume_unit: Literal["spacing", "scene"] = "spacing"
+    spread_start: bool = False
+    volume_unit: Literal["spacing", "scene"] = "scene"
     # Without growth by default, unlike other baselines.
     hull_points: int = Field(default=10_000, ge=0, le=5_000_000)
     grow_from: float = Field(default=0.0, ge=0, le=1)

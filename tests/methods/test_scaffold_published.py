@@ -144,20 +144,20 @@ def test_pulls_are_counted_before_the_first_round_and_rounds_end_before_the_last
     assert steps == [500, 1500, 14_999]
 
 
-def test_the_preset_of_anchors_in_space_time_is_as_published() -> None:
+def test_growth_of_anchors_in_space_time_is_counted_as_published() -> None:
     settings = Scaffold4DSettings.preset("paper")
     assert isinstance(settings, Scaffold4DSettings)
     shares = (settings.count_from, settings.grow_from, settings.grow_until)
     assert [round(share * settings.iterations) for share in shares] == [500, 1500, 59_999]
-    assert (settings.volume_unit, settings.spread_start) == ("scene", False)
 
 
-def test_anchors_in_space_time_start_as_published_too(balls: Scene) -> None:
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_anchors_in_space_time_start_as_published_too(preset: str, balls: Scene) -> None:
     settings = {"iterations": 1, "static": "pixels", "static_points": 300, "hull_points": 400, "max_anchors": 900}
-    model = Scaffold4D().fit(balls.training(), Scaffold4D.Config.preset("paper", settings), Run(seed=0)).model
+    model = Scaffold4D().fit(balls.training(), Scaffold4D.Config.preset(preset, settings), Run(seed=0)).model
     assert float(model.unit) == 1
-    assert float(model.offsets.detach().abs().max()) <= 0.0101  # one step of the rate of offsets
-    spaced = Scaffold4D.Config.preset("paper", {**settings, "volume_unit": "spacing", "spread_start": True})
+    assert float(model.offsets.detach().abs().max()) <= 0.0151  # one step of the rate of offsets
+    spaced = Scaffold4D.Config.preset(preset, {**settings, "volume_unit": "spacing", "spread_start": True})
     model = Scaffold4D().fit(balls.training(), spaced, Run(seed=0)).model
     assert float(model.unit) < 1
     assert float(model.offsets.detach().abs().max()) > 0.5
