@@ -19,9 +19,11 @@ import torch
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
+from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 from splashbench.scene.geometry import STEPS_PER_VOXEL
 
+from .resampling import cell_of
 from .subframe import CarrierState, Track, locate
 
 #: Which frames' carriers show what is between two of them: "both", or the one before, moved "forward".
@@ -90,7 +92,7 @@ def _of_frame(track: Track, t: int, fraction: float, overlap: np.ndarray) -> lis
         (1 - far) * torch.where(keep, torch.ones_like(fade), fade),
     )
     now = track.grid.to_voxels(state.positions.numpy())
-    gaps = torch.from_numpy(_has_left(here, now) & ~stays & (sample(track.phi[other], here) <= 0))
+    gaps = torch.from_numpy(_has_left(here, now, track.grid) & ~stays & (sample(track.phi[other], here) <= 0))
     distance = torch.from_numpy(np.linalg.norm(now - here, axis=1).astype(np.float32))
     filling = CarrierState(
         still.positions[gaps],
@@ -101,11 +103,8 @@ def _of_frame(track: Track, t: int, fraction: float, overlap: np.ndarray) -> lis
     return [(ids, state), (ids[gaps], filling)]
 
 
-def _has_left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+def _has_left(before: np.ndarray, now: np.ndarray, grid: Grid) -> np.ndarray:
     """Which carriers were, at `before` [n, 3], in a cell where none of them is `now` [n, 3]: bool [n]."""
-    cells = np.floor(np.concatenate([now, before]) / _GAP).astype(np.int64)
-    _, cells = np.unique(cells, axis=0, return_inverse=True)
-    cells = cells.reshape(-1)
-    taken = np.zeros(int(cells.max(initial=0)) + 1, dtype=bool)
-    taken[cells[: len(now)]] = True
-    return ~taken[cells[len(now) :]]
+    taken = np.zeros(np.prod(grid.shape), dtype=bool)
+    taken[cell_of(now / _GAP, grid)] = True
+    return ~taken[cell_of(before / _GAP, grid)]
