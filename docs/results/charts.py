@@ -174,10 +174,12 @@ def interpolation() -> Figure:
     first.plot([float(table[name, "psnr"]["mean"]) for name in names], range(len(names)), "o", color=BLUE)
     faded = {y: table[f"{name}, faded", "psnr"] for y, name in enumerate(names) if (f"{name}, faded", "psnr") in table}
     first.plot([float(row["mean"]) for row in faded.values()], list(faded), "|", color=GREY, ms=9, mew=1.5)
-    first.set_title("PSNR at timesteps that were not seen, dB →" + (" (bars: faded)" if faded else ""))
+    first.set_title("PSNR at unseen timesteps, dB →")
+    if faded:
+        figure.supxlabel("Upright bars: faded, the method's own renders of the neighbours, averaged.", fontsize=7.5)
     named_rows(first, names)
     scene_dots(second, loss, names)
-    second.set_title("← lost against a fit that saw every timestep, dB")
+    second.set_title("← lost against a fit to all timesteps, dB")
     legend(second)
     return figure
 
