@@ -47,6 +47,8 @@ class SplashSplatConfig(MethodConfig):
     signed_distance: SignedDistanceMethod = "silhouette"
     #: use the container's mesh, where the scene has one: what it hides, and where its walls are
     container: bool = True
+    #: without a mesh: the upright vessel that fills the container masks, where the scene has them
+    container_masks: bool = True
     #: look for masks that miss much of the liquid, and replace them
     detect_failed_masks: bool = True
     #: replace empty masks where other views see liquid; in the paper they say that there is none
@@ -141,6 +143,7 @@ class SplashSplatConfig(MethodConfig):
             "control_grid": "sides",
             "signed_distance": "carve",
             "container": False,
+            "container_masks": False,
             "detect_failed_masks": False,
             "replace_empty_masks": False,
             "camera_times": False,
@@ -202,6 +205,7 @@ class SplashSplatConfig(MethodConfig):
             transport_cells=self.transport_cells,
             signed_distance=self.signed_distance,
             container=self.container,
+            container_masks=self.container_masks,
             detect_failed_masks=self.detect_failed_masks,
             replace_empty_masks=self.replace_empty_masks,
             camera_times=self.camera_times,

@@ -25,6 +25,7 @@ from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.scene import TrainingScene
 
+from .container import known_container
 from .gravity_cues import GravityCues, gravity_cues
 from .occlusion import LiquidOcclusion
 
@@ -42,6 +43,7 @@ class FieldSettings:
     transport_cells: int
     signed_distance: SignedDistanceMethod
     container: bool
+    container_masks: bool
     detect_failed_masks: bool
     replace_empty_masks: bool
     camera_times: bool
@@ -126,7 +128,8 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
             interpolate_times=None if settings.camera_times else False,
             replace_empty=settings.replace_empty_masks,
         )
-        container = ContainerOcclusion.of(scene) if settings.container else None
+        known = known_container(scene, settings.container, settings.container_masks)
+        container, gravity = known.occlusion, known.gravity
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
     hull_grid, grid = Grid.over(bounds, settings.hull_cells), Grid.over(bounds, settings.transport_cells)
     occlusion = None
@@ -134,14 +137,14 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
         occlusion = LiquidOcclusion(container.mesh, hull_grid.voxel)
     depths = [None if occlusion is None else occlusion.depth(camera) for camera in silhouettes.cameras]
     cues = None
-    if scene.gravity is not None and (settings.pool or settings.ballistic):
+    if gravity is not None and (settings.pool or settings.ballistic):
         report(0.0, "looking for the jet and the pool")
         with run.stage("jet and pool"):
             cues = gravity_cues(
                 silhouettes,
                 bounds,
-                container,
-                scene.gravity,
+                known,
+                gravity,
                 None if scene.times_source == "nominal" else scene.metres_per_unit,
                 scene.times,
                 depths,

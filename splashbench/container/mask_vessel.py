@@ -1,0 +1,325 @@
+"""A container that nobody scanned, from its masks alone: the upright vessel that fills them.
+
+Most bowls, cups and jugs are surfaces of revolution, most tanks are boxes. Both have one outline at all heights, in
+another size at each. For a given axis and outline the widest such body within all masks is unique: at each height the
+largest ring whose projections lie within them. Axis and outline are those for which its silhouettes cover the masks
+best. Circles are tried first; then superellipses, from ellipses to boxes with rounded corners. Above the rim and below
+the foot the body is a phantom that hides in the masks of the opening and of the sides; it is cut off where the
+silhouettes stay as they are without it.
+
+The surface is the container's outside, open at the rim and without thickness. It needs no texture, and is refused where
+it does not cover the masks: a vessel with a handle, masks of something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from splashbench.arrays import Floats
+from splashbench.observe.container import depth_image
+from splashbench.scene import Camera
+from splashbench.scene.container import ContainerMesh
+
+#: Silhouettes of a body that is trusted cover this much of the masks, in the mean and in the worst view.
+LEAST_COVER, LEAST_COVER_OF_A_VIEW = 0.965, 0.93
+# Longer side of a mask in pixels, for the search and for the last fit.
+_SEARCH_PIXELS, _FINE_PIXELS = 100.0, 400.0
+# Rings and points of a ring, in the search and in the last fit; each radius is halved in on.
+_RINGS, _FINE_RINGS = (20, 24), (120, 64)
+_BISECTIONS = 10
+# A ring may lie so many pixels beyond a mask: masks are as coarse as their pixels.
+_TOLERANCE = 0.5
+# Share of the masks that the silhouettes may lose where phantoms are cut off, at either end.
+_PHANTOM_LOSS = 0.002
+# What a start is moved by: shifts in the sizes of the container, tilts in radians; aspect, exponent and turn.
+_STEPS = np.array([0.1, 0.1, 0.12, 0.12, 0.15, 2.0, 0.2])
+_CIRCLE, _BOX = (0.0, 2.0, 0.0), (0.0, 8.0, 0.0)
+_ASPECTS, _TURNS = (0.0, 0.25, 0.5), 6
+_EVALUATIONS = (120, 300)
+# The last search is finer, and starts with steps so many times smaller.
+_REFINED_PIXELS, _REFINED_RINGS, _REFINED_STEPS, _REFINED_EVALUATIONS = 240.0, (40, 32), 0.15, 100
+
+
+@dataclass(frozen=True, eq=False)
+class VesselBody:
+    """Rings of one outline along an axis. frame: [3, 3], two unit vectors across the axis and the axis. outline:
+    [angles, 2] points of the ring of radius 1. heights, radii: [K]."""
+
+    middle: Floats
+    frame: Floats
+    outline: Floats
+    heights: Floats
+    radii: Floats
+
+    def rings(self, radii: Floats) -> Floats:
+        """Points [K, angles, 3] of rings of `radii` [K] at the heights."""
+        middles = self.middle + self.heights[:, None] * self.frame[2]
+        points: Floats = middles[:, None] + radii[:, None, None] * (self.outline @ self.frame[:2])
+        return points
+
+    def part(self, first: int, last: int) -> VesselBody:
+        """Without the rings below number `first` and from `last` on."""
+        return VesselBody(self.middle, self.frame, self.outline, self.heights[first:last], self.radii[first:last])
+
+    def mesh(self) -> ContainerMesh:
+        """The surface, with a floor and without a lid."""
+        floor = np.broadcast_to(self.middle + self.heights[0] * self.frame[2], (len(self.outline), 3))
+        return _surface([floor, *self.rings(self.radii)])
+
+
+def _surface(rings: Sequence[Floats]) -> ContainerMesh:
+    """Rings [angles, 3], joined one after the other; one of radius 0 is a point."""
+    count, angles = len(rings), len(rings[0])
+    here = np.arange(count * angles).reshape(count, angles)
+    beside = np.roll(here, -1, axis=1)
+    faces = np.concatenate(
+        [
+            np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3),
+            np.stack([here[:-1], beside[1:], here[1:]], axis=-1).reshape(-1, 3),
+        ]
+    )
+    return ContainerMesh(np.concatenate(rings), faces)
+
+
+@dataclass(frozen=True, eq=False)
+class MaskedVessel:
+    """The outside of a vessel, in scene units.
+
+    Attributes:
+        body: the surface, open at the rim.
+        cover: overlap (intersection over union) of its silhouettes and the masks, per camera.
+    """
+
+    body: VesselBody
+    cover: dict[str, float]
+
+    @cached_property
+    def mesh(self) -> ContainerMesh:
+        """The surface, open at the rim."""
+        return self.body.mesh()
+
+    @property
+    def up(self) -> Floats:
+        """Unit vector [3] along the axis, from the foot to the rim."""
+        return self.body.frame[2]
+
+    @property
+    def rim(self) -> Floats:
+        """The ring [N, 3] at which the surface ends."""
+        return self.body.rings(self.body.radii)[-1]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the masks are those of such a body."""
+        covers = np.array(list(self.cover.values()))
+        return bool(covers.mean() >= LEAST_COVER and covers.min() >= LEAST_COVER_OF_A_VIEW)
+
+
+@dataclass(frozen=True, eq=False)
+class _MaskView:
+    """A mask at a working resolution. distance: float32 [H, W], pixels within the mask, negative beyond it."""
+
+    camera: Camera
+    mask: NDArray[np.bool_]
+    distance: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, camera: Camera, mask: NDArray[np.bool_], longest: float) -> _MaskView:
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        longer = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
+        small = camera.scaled(min(1.0, longest / longer))
+        shrunk = cv2.resize(mask.astype(np.float32), (small.width, small.height), interpolation=cv2.INTER_AREA) > 0.5
+        # What an image cuts off may go on beyond it.
+        padded = np.pad(shrunk, 1, mode="edge").astype(np.uint8)
+        inner = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        outer = cv2.distanceTransform(1 - padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        distance = np.where(padded > 0, inner - 0.5, 0.5 - outer).astype(np.float32)[1:-1, 1:-1]
+        return cls(small, shrunk, np.ascontiguousarray(distance))
+
+    def within(self, points: Floats) -> Floats:
+        """Pixels by which points [..., 3] lie within the mask; those beyond the image's border as the border."""
+        flat = points.reshape(-1, 3)
+        uv, depth = self.camera.project(flat)
+        at = np.clip(np.nan_to_num(uv - 0.5), 0, [self.camera.width - 1, self.camera.height - 1]).astype(np.float32)
+        values = cv2.remap(
+            self.distance, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )[0]
+        return np.where(depth > 0, values, -np.inf).reshape(points.shape[:-1])
+
+    def covered(self, mesh: ContainerMesh) -> float:
+        """Intersection over union of the mesh's silhouette and the mask."""
+        drawn = np.isfinite(depth_image(mesh, self.camera))
+        return float((drawn & self.mask).sum() / max((drawn | self.mask).sum(), 1))
+
+
+def vessel_from_masks(
+    cameras: Sequence[Camera], masks: Mapping[str, NDArray[np.bool_]], ups: Sequence[Floats] = ()
+) -> MaskedVessel | None:
+    """The upright vessel that fills `masks` (bool [H, W] by camera name) best.
+
+    ups: directions [3] that may be the axis, as the normal of a table; that which the cameras were held by is tried
+    anyway. None where the masks have no common hull, or fewer than two are given.
+    """
+    used = [camera for camera in cameras if camera.name in masks and masks[camera.name].any()]
+    if len(used) < 2:
+        return None
+    views = [_MaskView.of(camera, masks[camera.name], _SEARCH_PIXELS) for camera in used]
+    start = _meeting_point(views)
+    reach = min(float(np.linalg.norm(camera.center - start)) for camera in used)
+    best = None
+    for up in (_held_up(used), *ups):
+        search = _Search(start, frame_about(up), reach, views)
+        cover, at = search.best(np.array([0, 0, 0, 0, *_CIRCLE]), 4, _EVALUATIONS[0])
+        if best is None or cover > best[0]:
+            best = cover, at, search
+    assert best is not None
+    cover, at, search = best
+    if cover < LEAST_COVER:
+        boxes = [
+            np.concatenate([axis, [aspect, _BOX[1], turn]])
+            for axis in (np.zeros(4), at[:4])
+            for aspect in _ASPECTS
+            for turn in np.arange(_TURNS) * (np.pi / (_TURNS if aspect else 2 * _TURNS))
+        ]
+        box = search.best(max(boxes, key=search.cover), len(_STEPS), _EVALUATIONS[1])
+        cover, at = max((cover, at), box, key=lambda found: found[0])
+
+
+    def sharper(pixels: float) -> _Search:
+        return _Search(start, search.frame, reach, [_MaskView.of(camera, masks[camera.name], pixels) for camera in used])
+
+    free = 4 if at[5] == _CIRCLE[1] else len(_STEPS)
+    _, at = sharper(_REFINED_PIXELS).best(at, free, _REFINED_EVALUATIONS, _REFINED_RINGS, _REFINED_STEPS)
+    fine = sharper(_FINE_PIXELS)
+    body = fine.body(at, *_FINE_RINGS)
+    if body is None:
+        return None
+    body = _without_phantoms(body, fine.views)
+    mesh = body.mesh()
+    return MaskedVessel(body, {view.camera.name: view.covered(mesh) for view in fine.views})
+
+
+def _held_up(cameras: Sequence[Camera]) -> Floats:
+    """The direction [3] that is up in all images, as cameras are held level: across all their horizontal axes."""
+    across = np.stack([camera.w2c[0, :3] for camera in cameras])
+    ups = -np.stack([camera.w2c[1, :3] for camera in cameras]).mean(axis=0)
+    _, spread, axes = np.linalg.svd(across, full_matrices=True)
+    up = axes[-1] if len(spread) > 1 and spread[1] > 0.1 * spread[0] else ups
+    return np.asarray(up * np.sign(up @ ups) / np.linalg.norm(up))
+
+
+def frame_about(up: Floats, across: Floats | None = None) -> Floats:
+    """Three unit vectors [3, 3], the last along `up`, the first as near to `across` as that leaves."""
+    up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    first = np.eye(3)[int(np.argmin(np.abs(up)))] if across is None else across
+    first = first - (first @ up) * up
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])
+
+
+def _meeting_point(views: Sequence[_MaskView]) -> Floats:
+    """The point [3] nearest to the rays through the middles of the masks."""
+    total, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        rows, columns = np.nonzero(view.mask)
+        ray = np.linalg.solve(view.camera.K, [columns.mean() + 0.5, rows.mean() + 0.5, 1.0]) @ view.camera.w2c[:3, :3]
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        total += across
+        right += across @ view.camera.center
+    return np.asarray(np.linalg.lstsq(total, right, rcond=None)[0])
+
+
+def _superellipse(aspect: float, exponent: float, turn: float, points: int) -> Floats:
+    """Points [N, 2] of the outline |x / a|^p + |y a|^p = 1, a = exp(aspect), turned; corners are among them."""
+    angles = np.arange(points) * (2 * np.pi / points)
+    x, y = np.cos(angles), np.sin(angles)
+    length = (np.abs(x) ** exponent + np.abs(y) ** exponent) ** (-1 / exponent)
+    x, y = x * length * np.exp(aspect), y * length * np.exp(-aspect)
+    return np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Bodies by seven numbers: two shifts and two tilts of the axis, and the outline's aspect, exponent and turn.
+
+    start: a point within the container. frame: see `VesselBody`. reach: of the cameras.
+    """
+
+    start: Floats
+    frame: Floats
+    reach: float
+    views: Sequence[_MaskView]
+
+    def best(
+        self, first: Floats, free: int, evaluations: int, rings: tuple[int, int] = _RINGS, steps: float = 1.0
+    ) -> tuple[float, Floats]:
+        """Cover and numbers of the best body about `first`, of whose numbers the leading `free` may change."""
+        fixed = first[free:]
+        simplex = np.vstack([np.zeros(free), np.diag(steps * _STEPS[:free])]) + first[:free]
+        found = minimize(
+            lambda numbers: -self.cover(np.concatenate([numbers, fixed]), rings),
+            first[:free],
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-3, "fatol": 2e-4},
+        )
+        return -float(found.fun), np.concatenate([found.x, fixed])
+
+    def cover(self, numbers: Floats, rings: tuple[int, int] = _RINGS) -> float:
+        """Mean overlap of the body's silhouettes and the masks. rings: how many, and points of each."""
+        body = self.body(numbers, *rings)
+        if body is None:
+            return 0.0
+        mesh = body.mesh()
+        return float(np.mean([view.covered(mesh) for view in self.views]))
+
+    def body(self, numbers: Floats, rings: int, points: int) -> VesselBody | None:
+        """The widest body within the masks; None where its axis misses them."""
+        shift, tilt = 0.25 * self.reach * numbers[:2], numbers[2:4]
+        turned = frame_about(self.frame[2] + tilt @ self.frame[:2])
+        middle = self.start + shift @ self.frame[:2]
+        along = np.linspace(-0.6 * self.reach, 0.6 * self.reach, 301)
+        line = middle + along[:, None] * turned[2]
+        inside = np.min([view.within(line) for view in self.views], axis=0) > -_TOLERANCE
+        # The piece about the middle: another may lie where masks meet by chance.
+        breaks = np.flatnonzero(~inside)
+        nearest = int(np.argmin(np.where(inside, np.abs(along), np.inf)))
+        low = int(breaks[breaks < nearest].max(initial=-1)) + 1
+        high = int(breaks[breaks > nearest].min(initial=len(along))) - 1
+        if not inside.any() or high - low < 3:
+            return None
+        outline = _superellipse(float(numbers[4]), float(np.clip(numbers[5], 2, 30)), float(numbers[6]), points)
+        heights = np.linspace(along[low], along[high], rings)
+        body = VesselBody(middle, turned, outline, heights, np.zeros(rings))
+        lowest, highest = np.zeros(rings), np.full(rings, 0.6 * self.reach)
+        for _ in range(_BISECTIONS):
+            tried = 0.5 * (lowest + highest)
+            ring_points = body.rings(tried)
+            fits = np.min([view.within(ring_points).min(axis=1) for view in self.views], axis=0) > -_TOLERANCE
+            lowest, highest = np.where(fits, tried, lowest), np.where(fits, highest, tried)
+        return VesselBody(middle, turned, outline, heights, np.maximum(lowest, 1e-6 * self.reach))
+
+
+def _without_phantoms(body: VesselBody, views: Sequence[_MaskView]) -> VesselBody:
+    """The fewest rings whose silhouettes are those of the whole body: from the top down to the rim, then from below."""
+
+    def cover(part: VesselBody) -> float:
+        mesh = part.mesh()
+        return float(np.mean([view.covered(mesh) for view in views]))
+
+    def fewest(part: Callable[[int], VesselBody], count: int) -> int:
+        least, low, high = cover(part(count)) - _PHANTOM_LOSS, 2, count
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if cover(part(middle)) >= least else (middle, high)
+        return high
+
+    body = body.part(0, fewest(lambda rings: body.part(0, rings), len(body.heights)))
+    count = len(body.heights)
+    return body.part(count - fewest(lambda rings: body.part(count - rings, count), count), count)
