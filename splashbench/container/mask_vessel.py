@@ -49,8 +49,11 @@ _REFINED_PIXELS, _REFINED_RINGS, _REFINED_STEPS, _REFINED_EVALUATIONS = 240.0, (
 
 @dataclass(frozen=True, eq=False)
 class VesselBody:
-    """Rings of one outline along an axis. frame: [3, 3], two unit vectors across the axis and the axis. outline:
-    [angles, 2] points of the ring of radius 1. heights, radii: [K]."""
+    """Rings of one outline along an axis, scene units.
+
+    middle: [3] the axis's point of height 0. frame: [3, 3], two unit vectors across the axis, and the axis. outline:
+    [angles, 2] points of the ring of radius 1. heights, radii: [K] of the rings.
+    """
 
     middle: Floats
     frame: Floats
@@ -70,22 +73,17 @@ class VesselBody:
 
     def mesh(self) -> ContainerMesh:
         """The surface, with a floor and without a lid."""
-        floor = np.broadcast_to(self.middle + self.heights[0] * self.frame[2], (len(self.outline), 3))
-        return _surface([floor, *self.rings(self.radii)])
-
-
-def _surface(rings: Sequence[Floats]) -> ContainerMesh:
-    """Rings [angles, 3], joined one after the other; one of radius 0 is a point."""
-    count, angles = len(rings), len(rings[0])
-    here = np.arange(count * angles).reshape(count, angles)
-    beside = np.roll(here, -1, axis=1)
-    faces = np.concatenate(
-        [
+        points = self.rings(self.radii)
+        count, angles = points.shape[:2]
+        floor = self.middle + self.heights[0] * self.frame[2]
+        here = np.arange(count * angles).reshape(count, angles)
+        beside = np.roll(here, -1, axis=1)
+        faces = [
             np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3),
             np.stack([here[:-1], beside[1:], here[1:]], axis=-1).reshape(-1, 3),
+            np.stack([np.full(angles, count * angles), beside[0], here[0]], axis=-1),
         ]
-    )
-    return ContainerMesh(np.concatenate(rings), faces)
+        return ContainerMesh(np.vstack([points.reshape(-1, 3), floor]), np.concatenate(faces))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +163,9 @@ def vessel_from_masks(
     """The upright vessel that fills `masks` (bool [H, W] by camera name) best.
 
     ups: directions [3] that may be the axis, as the normal of a table; that which the cameras were held by is tried
-    anyway. None where the masks have no common hull, or fewer than two are given.
+    anyway. None where the masks have no common hull, or fewer than two say anything.
     """
-    used = [camera for camera in cameras if camera.name in masks and masks[camera.name].any()]
+    used = [camera for camera in cameras if camera.name in masks and 0 < masks[camera.name].mean() < 1]
     if len(used) < 2:
         return None
     views = [_MaskView.of(camera, masks[camera.name], _SEARCH_PIXELS) for camera in used]
@@ -191,9 +189,10 @@ def vessel_from_masks(
         box = search.best(max(boxes, key=search.cover), len(_STEPS), _EVALUATIONS[1])
         cover, at = max((cover, at), box, key=lambda found: found[0])
 
-
     def sharper(pixels: float) -> _Search:
-        return _Search(start, search.frame, reach, [_MaskView.of(camera, masks[camera.name], pixels) for camera in used])
+        return _Search(
+            start, search.frame, reach, [_MaskView.of(camera, masks[camera.name], pixels) for camera in used]
+        )
 
     free = 4 if at[5] == _CIRCLE[1] else len(_STEPS)
     _, at = sharper(_REFINED_PIXELS).best(at, free, _REFINED_EVALUATIONS, _REFINED_RINGS, _REFINED_STEPS)

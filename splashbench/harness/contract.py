@@ -58,6 +58,7 @@ class Run:
         cache: a folder for parts that runs of one study share, see `reuse`; None in ordinary runs.
         reused: parts that came from there, and the seconds their fit took in an earlier run.
         stages: seconds of the fit's stages, see `stage`.
+        notes: what the method found out and went by, see `note`.
     """
 
     seed: int = 0
@@ -67,6 +68,7 @@ class Run:
     cache: Path | None = None
     reused: dict[str, float] = field(default_factory=dict)
     stages: dict[str, float] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
     _overhead_seconds: float = 0.0
     _digests: dict[Path, str] = field(default_factory=dict)
     _report: Callable[[float, str], None] | None = None
@@ -85,6 +87,10 @@ class Run:
             yield
         finally:
             self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+
+    def note(self, name: str, text: str) -> None:
+        """Write into record.json what the method found out by itself and went by, in a few words."""
+        self.notes[name] = text
 
     def checkpoint(self, fitted: Fitted) -> None:
         """Offer an intermediate state; where the harness collects them it saves it outside the clock."""

@@ -58,6 +58,7 @@ class Outcome(BaseModel):
     seconds: float | None = None
     reused: dict[str, float] = {}
     stages: dict[str, float] = {}
+    notes: dict[str, str] = {}
     render_fps: float | None = None
     timed_frames: int | None = None
     primitives_per_frame: float | None = None

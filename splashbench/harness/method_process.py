@@ -84,6 +84,7 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
         seconds=seconds,
         reused=run.reused,
         stages=run.stages,
+        notes=run.notes,
         settings=config.model_dump(mode="json"),
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),

@@ -187,6 +187,7 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
                     "fit_seconds": outcome.seconds,
                     "reused": outcome.reused,
                     "stages": outcome.stages,
+                    "notes": outcome.notes,
                     "storage_bytes": storage,
                     "dynamic_bytes": storage - static,
                 }

@@ -14,6 +14,7 @@ _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 
 #: No cost of a run comes near; anything beyond is no measurement (and infinity is none either).
 _MAX_COST = 10**15
+_MAX_NOTE, _MAX_NOTES = 500, 50
 #: Figures by the names that records and results had before version 0.2 -> today's names.
 RENAMED_FIGURES = {"carriers_per_frame": "particles_per_frame"}
 
@@ -80,6 +81,8 @@ class Record(BaseModel):
     reused: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
     #: seconds of the fit's stages, where the method tells them
     stages: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
+    #: what the method found out by itself and went by
+    notes: dict[str, Annotated[str, Field(max_length=_MAX_NOTE)]] = Field(default_factory=dict, max_length=_MAX_NOTES)
     render_fps: float | None = Field(default=None, ge=0, le=_MAX_COST)
     timed_frames: int | None = Field(default=None, ge=0)
     peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)

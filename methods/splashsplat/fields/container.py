@@ -17,7 +17,6 @@ import numpy as np
 from splashbench.container.mask_vessel import MaskedVessel, vessel_from_masks
 from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera
-from splashbench.scene.container import ContainerMesh
 from splashbench.scene.scene import TrainingScene
 
 ContainerSource = Literal["mesh", "masks", "none"]
@@ -37,10 +36,11 @@ class KnownContainer:
     gravity: np.ndarray | None
     source: ContainerSource
 
-    @property
-    def inside(self) -> ContainerMesh | None:
-        """The mesh by whose inner walls pools are looked for. An outside alone has none."""
-        return self.occlusion.mesh if self.occlusion is not None and self.source == "mesh" else None
+    def __str__(self) -> str:
+        if self.occlusion is None:
+            return "not known"
+        origin = "mesh of the scene" if self.source == "mesh" else "upright vessel within the container masks"
+        return f"{origin}, {'opaque' if self.occlusion.hides else 'transparent'}"
 
 
 def known_container(scene: TrainingScene, mesh: bool, from_masks: bool) -> KnownContainer:

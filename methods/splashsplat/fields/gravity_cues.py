@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from splashbench.observe.grid import Bounds, Grid
+from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.observe.signed_distance import signed_distance_frames
 from splashbench.observe.silhouettes import Silhouettes
 
-from .container import KnownContainer
 from .jet import STANDARD_GRAVITY, Jet, Slices, fit_jets, framed, open_floor, slices_of
 from .pool import LiquidPool
 from .vessel import Vessel, upright
@@ -77,7 +77,7 @@ class GravityCues:
 def gravity_cues(
     silhouettes: Silhouettes,
     bounds: Bounds,
-    container: KnownContainer,
+    container: ContainerOcclusion | None,
     gravity: np.ndarray,
     metres_per_unit: float | None,
     times: np.ndarray,
@@ -91,11 +91,12 @@ def gravity_cues(
     looked for, as the speed of a fall is not known either. container_depths: see `GravityCues`.
     """
     turn = upright(gravity)
-    occlusion = container.occlusion
-    vessel = None if container.inside is None else Vessel.of(container.inside, gravity)
-    pool = None
-    if vessel is not None and occlusion is not None and find_pool:
-        pool = LiquidPool(vessel, silhouettes, occlusion.hides)
+    vessel = None if container is None else Vessel.of(container.mesh, gravity)
+    pool = (
+        None
+        if vessel is None or container is None or not find_pool
+        else LiquidPool(vessel, silhouettes, container.hides)
+    )
     levels = np.full(silhouettes.n_frames, np.nan) if pool is None else pool.levels()
     jets: list[Jet | None] = [None] * silhouettes.n_frames
     floor = -np.inf
@@ -103,7 +104,7 @@ def gravity_cues(
         grid = Grid.over(bounds, _CELLS)
         upright_nodes = grid.nodes().reshape(-1, 3) @ turn.T
         frames: list[Slices] = []
-        for phi in signed_distance_frames(silhouettes, grid, "silhouette", occlusion):
+        for phi in signed_distance_frames(silhouettes, grid, "silhouette", container):
             filled = np.clip(0.5 - phi.reshape(-1), 0, 1)
             inside = filled > 0
             frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))

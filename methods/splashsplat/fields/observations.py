@@ -130,6 +130,14 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
         )
         known = known_container(scene, settings.container, settings.container_masks)
         container, gravity = known.occlusion, known.gravity
+    run.note("container", str(known))
+    if gravity is not None:
+        run.note(
+            "gravity",
+            "of the scene"
+            if scene.gravity is not None
+            else f"along the container's axis, {np.round(gravity, 4).tolist()}",
+        )
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
     hull_grid, grid = Grid.over(bounds, settings.hull_cells), Grid.over(bounds, settings.transport_cells)
     occlusion = None
@@ -143,7 +151,7 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
             cues = gravity_cues(
                 silhouettes,
                 bounds,
-                known,
+                container,
                 gravity,
                 None if scene.times_source == "nominal" else scene.metres_per_unit,
                 scene.times,
