@@ -19,6 +19,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
+from splashbench.container.mask_vessel import vessel_from_masks
+from splashbench.container.verification import overlay
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.report.results import ResultFile
@@ -215,6 +217,22 @@ def four_steps(scene: Scene, submission: Submission) -> Path:
     return store(figure, "method_steps.png", 110, colours=0)
 
 
+def vessels() -> list[Path]:
+    """The vessels found in the container masks, over two training views of each scene."""
+    figure = Figure(figsize=(10, 1.8), layout="constrained")
+    panels = iter(figure.subplots(1, 4))
+    for name in ("opaque_bowl", "glass_tank"):
+        folder = WORK / f"{name}_of_two_frames"
+        scene = Scene.open(made(folder, "synth", "scene", name, str(folder), "--size", "480x320", "--timesteps", "2"))
+        masks = {view: mask for view in scene.train if (mask := scene.container_mask(view)) is not None}
+        vessel = vessel_from_masks([scene.cameras[view] for view in scene.train], masks)
+        assert vessel is not None
+        for view in (scene.train[0], scene.train[2]):
+            picture = overlay(vessel.mesh, np.eye(4), scene.cameras[view], masks[view], scene.image(view, 0))
+            bare(next(panels)).imshow(picture[window(masks[view], 30)])
+    return [store(figure, "method_vessel.png", 130)]
+
+
 def lives(active: NDArray[np.bool_], times: NDArray[np.float64]) -> Path:
     """How many carriers of each frame were born there, and how many came from an earlier frame."""
     born = active & ~np.roll(active, 1, axis=0)
@@ -271,6 +289,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "chart": chart,
     "test_view": test_view,
     "method": method,
+    "vessels": vessels,
     "tutorial": tutorial,
 }
 
