@@ -40,11 +40,15 @@ _TOLERANCE = 0.5
 _PHANTOM_LOSS = 0.002
 # What a start is moved by: shifts in the sizes of the container, tilts in radians; aspect, exponent and turn.
 _STEPS = np.array([0.1, 0.1, 0.12, 0.12, 0.15, 2.0, 0.2])
-_CIRCLE, _BOX = (0.0, 2.0, 0.0), (0.0, 8.0, 0.0)
+_CIRCLE, _BOX_EXPONENT = (0.0, 2.0, 0.0), 8.0
 _ASPECTS, _TURNS = (0.0, 0.25, 0.5), 6
 _EVALUATIONS = (120, 300)
 # The last search is finer, and starts with steps so many times smaller.
 _REFINED_PIXELS, _REFINED_RINGS, _REFINED_STEPS, _REFINED_EVALUATIONS = 240.0, (40, 32), 0.15, 100
+# Fewer masks, or cameras within fewer degrees, are filled by bodies of any tilt.
+_LEAST_VIEWS, _LEAST_DEGREES = 3, 15.0
+# Cameras that stand so far above or below the container, on the mean and as a share of their distance, look down.
+_ABOVE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,17 +167,22 @@ def vessel_from_masks(
     """The upright vessel that fills `masks` (bool [H, W] by camera name) best.
 
     ups: directions [3] that may be the axis, as the normal of a table; that which the cameras were held by is tried
-    anyway. None where the masks have no common hull, or fewer than two say anything.
+    anyway. None where the masks have no common hull, or where fewer than three
+    say anything, or their cameras stand so close together that a body of any tilt would fill them.
     """
     used = [camera for camera in cameras if camera.name in masks and 0 < masks[camera.name].mean() < 1]
-    if len(used) < 2:
-        return None
     views = [_MaskView.of(camera, masks[camera.name], _SEARCH_PIXELS) for camera in used]
+    used = [camera for camera, view in zip(used, views) if view.mask.any()]
+    views = [view for view in views if view.mask.any()]
+    if len(used) < _LEAST_VIEWS:
+        return None
     start = _meeting_point(views)
     reach = min(float(np.linalg.norm(camera.center - start)) for camera in used)
+    if reach == 0 or _widest_angle(used, start) < _LEAST_DEGREES:
+        return None
     best = None
-    for up in (_held_up(used), *ups):
-        search = _Search(start, frame_about(up), reach, views)
+    for up in (_held_up(used, start), *ups):
+        search = _Search(start, _frame_about(up), reach, views)
         cover, at = search.best(np.array([0, 0, 0, 0, *_CIRCLE]), 4, _EVALUATIONS[0])
         if best is None or cover > best[0]:
             best = cover, at, search
@@ -181,7 +190,7 @@ def vessel_from_masks(
     cover, at, search = best
     if cover < LEAST_COVER:
         boxes = [
-            np.concatenate([axis, [aspect, _BOX[1], turn]])
+            np.concatenate([axis, [aspect, _BOX_EXPONENT, turn]])
             for axis in (np.zeros(4), at[:4])
             for aspect in _ASPECTS
             for turn in np.arange(_TURNS) * (np.pi / (_TURNS if aspect else 2 * _TURNS))
@@ -200,24 +209,38 @@ def vessel_from_masks(
     body = fine.body(at, *_FINE_RINGS)
     if body is None:
         return None
-    body = _without_phantoms(body, fine.views)
-    mesh = body.mesh()
-    return MaskedVessel(body, {view.camera.name: view.covered(mesh) for view in fine.views})
+    vessel = MaskedVessel(_without_phantoms(body, fine.views), {})
+    vessel.cover.update((view.camera.name, view.covered(vessel.mesh)) for view in fine.views)
+    return vessel
 
 
-def _held_up(cameras: Sequence[Camera]) -> Floats:
-    """The direction [3] that is up in all images, as cameras are held level: across all their horizontal axes."""
+def _widest_angle(cameras: Sequence[Camera], start: Floats) -> float:
+    """Degrees between the two directions from `start` that differ most."""
+    away = np.stack([camera.center - start for camera in cameras])
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    return float(np.rad2deg(np.arccos(np.clip((away @ away.T).min(), -1, 1))))
+
+
+def _held_up(cameras: Sequence[Camera], start: Floats) -> Floats:
+    """The direction [3] that is up, as cameras are held level: across all their horizontal axes.
+
+    Cameras look down into a vessel. Where they do, that tells up from down, as one may hang upside down.
+    """
     across = np.stack([camera.w2c[0, :3] for camera in cameras])
-    ups = -np.stack([camera.w2c[1, :3] for camera in cameras]).mean(axis=0)
+    in_images = -np.stack([camera.w2c[1, :3] for camera in cameras]).mean(axis=0)
     _, spread, axes = np.linalg.svd(across, full_matrices=True)
-    up = axes[-1] if len(spread) > 1 and spread[1] > 0.1 * spread[0] else ups
-    return np.asarray(up * np.sign(up @ ups) / np.linalg.norm(up))
+    up = axes[-1] if spread[1] > 0.1 * spread[0] else in_images
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    away = np.stack([camera.center - start for camera in cameras])
+    height = float((away @ up / np.linalg.norm(away, axis=1)).mean())
+    sense = height if abs(height) > _ABOVE else float(up @ in_images)
+    return np.asarray(-up if sense < 0 else up)
 
 
-def frame_about(up: Floats, across: Floats | None = None) -> Floats:
-    """Three unit vectors [3, 3], the last along `up`, the first as near to `across` as that leaves."""
+def _frame_about(up: Floats) -> Floats:
+    """Three unit vectors [3, 3], the last along `up`."""
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    first = np.eye(3)[int(np.argmin(np.abs(up)))] if across is None else across
+    first = np.eye(3)[int(np.argmin(np.abs(up)))]
     first = first - (first @ up) * up
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(up, first), up])
@@ -281,7 +304,7 @@ class _Search:
     def body(self, numbers: Floats, rings: int, points: int) -> VesselBody | None:
         """The widest body within the masks; None where its axis misses them."""
         shift, tilt = 0.25 * self.reach * numbers[:2], numbers[2:4]
-        turned = frame_about(self.frame[2] + tilt @ self.frame[:2])
+        turned = _frame_about(self.frame[2] + tilt @ self.frame[:2])
         middle = self.start + shift @ self.frame[:2]
         along = np.linspace(-0.6 * self.reach, 0.6 * self.reach, 301)
         line = middle + along[:, None] * turned[2]

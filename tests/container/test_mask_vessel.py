@@ -138,6 +138,26 @@ def test_masks_that_do_not_belong_together_are_refused() -> None:
     assert vessel is None or not vessel.trusted
 
 
+def test_cameras_that_hang_upside_down_do_not_turn_the_vessel_over() -> None:
+    cameras = [Camera(c.name, c.width, c.height, c.K, np.diag([-1.0, -1, 1, 1]) @ c.w2c) for c in rig()]
+    vessel = found(bowl(), cameras)
+    assert vessel.trusted
+    assert tilt(vessel) < 1.5
+
+
+def test_cameras_in_one_place_tell_nothing() -> None:
+    first = rig()[0]
+    cameras = [Camera(str(k), first.width, first.height, first.K, first.w2c) for k in range(4)]
+    assert vessel_from_masks(cameras, masks_of(bowl(), cameras)) is None
+    assert vessel_from_masks(rig()[:2], masks_of(bowl(), rig()[:2])) is None
+
+
+def test_masks_of_dots_tell_nothing() -> None:
+    dots = np.zeros((240, 320), bool)
+    dots[::12, ::12] = True
+    assert vessel_from_masks(rig(), {camera.name: dots for camera in rig()}) is None
+
+
 def test_masks_that_say_nothing_are_left_out() -> None:
     cameras = rig()
     masks = masks_of(bowl(), cameras)

@@ -24,6 +24,8 @@ ContainerSource = Literal["mesh", "masks", "none"]
 # Of the liquid's pixels within the container masks, the share in front of the outer walls from which a container counts
 # as transparent: what spills over an opaque one is less.
 _SEEN_THROUGH = 0.15
+# Frames that are looked at, spread over the recording.
+_FRAMES = 24
 # Pixels beside the rim that tell nothing, as a share of the image's longer side.
 _RIM_MARGIN = 0.01
 
@@ -66,19 +68,22 @@ def shows_liquid_through_walls(scene: TrainingScene, vessel: MaskedVessel, masks
     for name, mask in masks.items():
         camera = scene.cameras[name]
         opening = _opening(camera, vessel.rim)
-        for t in range(scene.n_frames):
-            liquid = scene.mask(name, t) & mask
+        if opening is None:
+            continue
+        for t in np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, _FRAMES)).round().astype(int)):
+            liquid = scene.mask(name, int(t)) & mask
             everywhere += int(liquid.sum())
             walls += int((liquid & ~opening).sum())
     return walls > _SEEN_THROUGH * max(everywhere, 1)
 
 
-def _opening(camera: Camera, rim: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the pixels that look through the opening, and those near the rim or above it."""
+def _opening(camera: Camera, rim: np.ndarray) -> np.ndarray | None:
+    """bool [H, W]: the pixels that look through the opening, and those near the rim; None where it is not in front."""
     pixels, depth = camera.project(rim)
+    if (depth <= 0).any():
+        return None
     drawn = np.zeros((camera.height, camera.width), np.uint8)
-    if (depth > 0).all():
-        cv2.fillPoly(drawn, [np.rint(pixels).astype(np.int32)], 1)
+    cv2.fillPoly(drawn, [np.rint(pixels).astype(np.int32)], 1)
     radius = max(1, round(_RIM_MARGIN * max(camera.width, camera.height)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return np.asarray(cv2.dilate(drawn, disc) > 0)
