@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "4"
+VERSION = "5"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -77,11 +77,11 @@ class SplashSplatConfig(MethodConfig):
     variant: TrackingVariant = "full"
     correction: PositiveFloat = 1.0
     kill_outside: PositiveFloat = 0.5
-    kill_inside: float | None = Field(-3.0, lt=0)
+    kill_inside: float | None = Field(-6.0, lt=0)
     cell_capacity: PositiveInt | None = 8
     #: frames that a carrier lasts on average; None for as long as it stays in the liquid
-    lifetime: PositiveInt | None = 2
-    shell_depth: PositiveFloat = 1.5
+    lifetime: PositiveInt | None = 4
+    shell_depth: PositiveFloat = 4.0
     #: how far beyond the surface carriers are born, too: coarse grids miss what is thinner than a voxel
     shell_outside: float = Field(0, ge=0, le=0.5)
     min_per_cell: PositiveInt = 2
@@ -92,7 +92,12 @@ class SplashSplatConfig(MethodConfig):
     feature_size: PositiveInt = 32
     #: Gaussians of a carrier
     children: int = Field(1, ge=1, le=6)
-    base_scale: PositiveFloat = 0.35
+    #: extent of a Gaussian at the start, in transport voxels
+    base_scale: PositiveFloat = 0.5
+    #: how far a Gaussian may move off its carrier, in extents of the carrier
+    offset_bound: PositiveFloat = 3.0
+    #: depth below the surface at which opacity has faded to half, in transport voxels
+    opacity_band: PositiveFloat = 7.0
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
@@ -117,7 +122,7 @@ class SplashSplatConfig(MethodConfig):
     foreground_weight: float = Field(0.5, ge=0)
     gradient_weight: float = Field(0.1, ge=0)
     ssim_weight: float = Field(0.2, ge=0)
-    silhouette_weight: float = Field(0.7, ge=0)
+    silhouette_weight: float = Field(0.2, ge=0)
     covariance_weight: float = Field(0.01, ge=0)
     separation_weight: float = Field(0.1, ge=0)
     color_weight: float = Field(1.0, ge=0)
@@ -159,6 +164,10 @@ class SplashSplatConfig(MethodConfig):
             "shell_depth": 3.0,
             "max_per_cell": 5,
             "children": 2,
+            "base_scale": 0.35,
+            "offset_bound": 1.0,
+            "opacity_band": 3.0,
+            "silhouette_weight": 0.7,
             "scale_residual": "linear",
             "iterations": 3000,
             "learning_rate_features": 2e-3,
@@ -253,7 +262,11 @@ class SplashSplatConfig(MethodConfig):
     @property
     def decoder(self) -> DecoderSettings:
         return DecoderSettings(
-            feature_size=self.feature_size, children=self.children, scale_residual=self.scale_residual
+            feature_size=self.feature_size,
+            children=self.children,
+            offset_bound=self.offset_bound,
+            opacity_band=self.opacity_band,
+            scale_residual=self.scale_residual,
         )
 
     @property
