@@ -71,8 +71,7 @@ class FittedSplashSplat(Fitted):
 
     def _decoded(self, camera: Camera, ids: torch.Tensor, state: CarrierState) -> Children:
         if self.occlusion is not None:
-            behind = torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
-            seen = 1 - behind.to(torch.float32)
+            seen = 1 - torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
             state = replace(state, visibility=seen if state.visibility is None else seen * state.visibility)
         look = self.liquid.appearance
         eye = torch.tensor(camera.center, dtype=torch.float32)

@@ -19,6 +19,7 @@ from splashbench.scene.scene import TrainingScene
 
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
 from .appearance.targets import collect_targets
+from .carriers.coverage import uncovered_by_any
 from .carriers.population import Carriers
 from .carriers.subframe import Track
 from .carriers.tracking import CarrierTracker, Simulation, Tracking
@@ -117,12 +118,24 @@ def _tracking(observations: Observations, scene: TrainingScene, config: SplashSp
         limit = _SEEN_THROUGH * config.shell_depth * observations.ratio
         return seen_by_any(phi, observations.hull_grid, points, cameras, depths, limit, observations.ratio)
 
+    def uncovered(t: int, phi: np.ndarray) -> np.ndarray:
+        return uncovered_by_any(
+            phi,
+            observations.hull_grid,
+            observations.silhouettes,
+            t,
+            observations.container_depths,
+            config.coverage_reach,
+            observations.ratio,
+        )
+
     return Tracking(
         observations.hull_grid,
         observations.grid,
         config.carriers,
         seed,
         seen=seen if config.visible_only else None,
+        uncovered=uncovered if config.coverage_reach > 0 else None,
         landed=observations.landed if config.ballistic else None,
         simulation=_simulation(observations, scene, seed) if config.variant == "flip" else None,
     )

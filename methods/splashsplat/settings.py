@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "5"
+VERSION = "6"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -77,15 +77,19 @@ class SplashSplatConfig(MethodConfig):
     variant: TrackingVariant = "full"
     correction: PositiveFloat = 1.0
     kill_outside: PositiveFloat = 0.5
-    kill_inside: float | None = Field(-6.0, lt=0)
+    kill_inside: float | None = Field(-16.0, lt=0)
     cell_capacity: PositiveInt | None = 8
     #: frames that a carrier lasts on average; None for as long as it stays in the liquid
     lifetime: PositiveInt | None = 4
-    shell_depth: PositiveFloat = 4.0
+    shell_depth: PositiveFloat = 12.0
     #: how far beyond the surface carriers are born, too: coarse grids miss what is thinner than a voxel
     shell_outside: float = Field(0, ge=0, le=0.5)
+    #: how far from the surface a carrier is born for a pixel of a mask that no liquid covers; 0 for none
+    coverage_reach: float = Field(4.0, ge=0)
     min_per_cell: PositiveInt = 2
     max_per_cell: PositiveInt = 6
+    #: of cells deeper than 3 voxels; None for as many as elsewhere
+    interior_per_cell: PositiveInt | None = 1
     #: no carriers where no training view can see them
     visible_only: bool = True
     # Decoder
@@ -97,7 +101,7 @@ class SplashSplatConfig(MethodConfig):
     #: how far a Gaussian may move off its carrier, in extents of the carrier
     offset_bound: PositiveFloat = 3.0
     #: depth below the surface at which opacity has faded to half, in transport voxels
-    opacity_band: PositiveFloat = 7.0
+    opacity_band: PositiveFloat = 20.0
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
@@ -162,7 +166,9 @@ class SplashSplatConfig(MethodConfig):
             "cell_capacity": None,
             "lifetime": None,
             "shell_depth": 3.0,
+            "coverage_reach": 0.0,
             "max_per_cell": 5,
+            "interior_per_cell": None,
             "children": 2,
             "base_scale": 0.35,
             "offset_bound": 1.0,
@@ -256,6 +262,7 @@ class SplashSplatConfig(MethodConfig):
                 outside=self.shell_outside,
                 min_per_cell=self.min_per_cell,
                 max_per_cell=max(self.min_per_cell, self.max_per_cell),
+                interior_per_cell=self.interior_per_cell,
             ),
         )
 

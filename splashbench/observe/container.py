@@ -86,3 +86,11 @@ def hidden(points: np.ndarray, depth: np.ndarray, camera: Camera, tolerance: flo
     (scene units) behind the depth at its pixel; points beside the image or behind the camera are not.
     """
     return mesh_kernels.behind(points, camera.projection, depth, tolerance)
+
+
+def hidden_share(points: np.ndarray, depth: np.ndarray, camera: Camera, tolerance: float) -> np.ndarray:
+    """As `hidden`, by how much: float32 [n] in [0, 1], the share of a pixel about each point in which it is hidden.
+
+    A rim runs through pixels. What lies near its outline is half hidden there and does not vanish as a whole.
+    """
+    return mesh_kernels.share_behind(points, camera.projection, depth, tolerance)

@@ -246,3 +246,54 @@ def behind(points: np.ndarray, projection: np.ndarray, depth: np.ndarray, tolera
         smallest=4096,
     )
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _share_behind(
+    points: np.ndarray,
+    projection: np.ndarray,
+    depth: np.ndarray,
+    tolerance: float,
+    out: np.ndarray,
+    start: int,
+    stop: int,
+) -> None:
+    height, width = depth.shape
+    for n in range(start, stop):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        w = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+        out[n] = 0.0
+        if not w > 0.0:
+            continue
+        u = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / w
+        v = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / w
+        if not (0.0 <= u < width and 0.0 <= v < height):
+            continue
+        column, row = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
+        a, b = u - 0.5 - column, v - 0.5 - row
+        left, right = max(column, 0), min(column + 1, width - 1)
+        top, bottom = max(row, 0), min(row + 1, height - 1)
+        reach = w - tolerance
+        upper = (1 - a) * (reach > depth[top, left]) + a * (reach > depth[top, right])
+        lower = (1 - a) * (reach > depth[bottom, left]) + a * (reach > depth[bottom, right])
+        out[n] = (1 - b) * upper + b * lower
+
+
+def share_behind(points: np.ndarray, projection: np.ndarray, depth: np.ndarray, tolerance: float) -> np.ndarray:
+    """float32 [n] in [0, 1]: how much of a pixel about each of `points` [n, 3] lies more than `tolerance` in front of
+    it, by the four pixels of `depth` [h, w] that are nearest; 0 outside the image.
+
+    projection: as for `behind`.
+    """
+    out = np.empty(len(points), dtype=np.float32)
+    over_range(
+        _share_behind,
+        len(points),
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(projection, np.float64),
+        np.ascontiguousarray(depth, np.float32),
+        float(tolerance),
+        out,
+        smallest=4096,
+    )
+    return out

@@ -38,7 +38,8 @@ class TrainingTarget:
     frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
     window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
     kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all Gaussians. area: pixels over which the
-    silhouette term averages. hidden: bool [n], carriers of the frame that the container hides from the view, or None.
+    silhouette term averages. hidden: uint8 [n], by how many 255ths the container hides each carrier of the
+    frame from the view, or None.
     frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
     the losses read, see `splashbench.render.tile_modes`.
     """
@@ -56,8 +57,8 @@ class TrainingTarget:
 
     @property
     def visibility(self) -> Tensor | None:
-        """1 for the carriers that the view can see and 0 for those that the container hides, float32 [n], or None."""
-        return None if self.hidden is None else 1 - self.hidden.to(torch.float32)
+        """1 for the carriers that the view can see, 0 for those that the container hides, float32 [n], or None."""
+        return None if self.hidden is None else 1 - self.hidden.to(torch.float32) / 255
 
 
 def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
@@ -88,6 +89,11 @@ def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) 
     )
 
 
+def _in_bytes(shares: np.ndarray) -> Tensor:
+    """Shares in [0, 1] as uint8: there is one for every carrier of every photograph."""
+    return torch.from_numpy(np.rint(255 * shares).astype(np.uint8))
+
+
 def _modes(camera: Camera, box: tuple[int, int, int, int]) -> np.ndarray:
     """Tiles of the whole image in which the losses read colours: those of `box`."""
     read = np.zeros((camera.height, camera.width), dtype=bool)
@@ -109,7 +115,7 @@ def collect_targets(
 
     backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
     its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
-    and positions [n, 3], which of them the container hides (bool [n]). frozen: of each view, Gaussians of the
+    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). frozen: of each view, Gaussians of the
     background that are drawn together with the liquid's. silhouette_norm: the silhouette term averages over the
     "image", as in the paper, whose images are crops about the liquid; or over the "window" around all masks of the
     view, such a crop of images that are none; or over the "mask".
@@ -154,7 +160,7 @@ def collect_targets(
                     photograph=photograph,
                     background=background if background.ndim == 1 else background[y0:y1, x0:x1],
                     area=areas.get(silhouette_norm, float(mask.sum())),
-                    hidden=None if hidden is None else torch.from_numpy(hidden(name, positions)),
+                    hidden=None if hidden is None else _in_bytes(hidden(name, positions)),
                     frozen=frozen.get(name),
                     modes=_modes(camera, box) if name in frozen else None,
                 )

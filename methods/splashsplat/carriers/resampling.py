@@ -18,6 +18,8 @@ from splashbench.observe.kernels import sample
 # A cell's corner is this far from its middle, in cells: beyond it, no part of the cell can be in the shell.
 _HALF_DIAGONAL = 0.87
 _TRIES_PER_CARRIER = 6
+# Below this depth, in voxels, few carriers do: the liquid's surface lies there where the hull is much larger than it.
+_INTERIOR = 3.0
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,14 @@ class ShellSettings:
     """The shell and how full it is.
 
     depth, outside: how far it reaches below and above phi = 0, transport voxels. min_per_cell, max_per_cell: range of
-    a cell's target population.
+    a cell's target population. interior_per_cell: the same for cells deeper than 3 voxels; None for no difference.
     """
 
     depth: float = 1.5
     outside: float = 0.0
     min_per_cell: int = 2
     max_per_cell: int = 2
+    interior_per_cell: int | None = None
     curvature_weight: float = 0.1
 
 
@@ -64,7 +67,10 @@ def target_population(phi: np.ndarray, centres: np.ndarray, ratio: float, shell:
         laplacian += sample(phi, points + step) + sample(phi, points - step)
     importance = 0.5 * np.exp(-np.abs(middle)) + shell.curvature_weight * np.abs(laplacian)
     span = shell.max_per_cell - shell.min_per_cell
-    return np.floor(shell.min_per_cell + np.minimum(importance, 1) * span + 0.5).astype(np.int64)
+    population = np.floor(shell.min_per_cell + np.minimum(importance, 1) * span + 0.5).astype(np.int64)
+    if shell.interior_per_cell is not None:
+        population[middle < -_INTERIOR] = shell.interior_per_cell
+    return population
 
 
 def newborns(

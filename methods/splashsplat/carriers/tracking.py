@@ -62,7 +62,8 @@ class Tracking:
     """What the loop needs besides the frames.
 
     hull_grid: of phi_t. grid: the transport grid, of carriers and motion. seen: given phi_t and hull-grid coordinates
-    [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. landed: given t, where
+    [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. uncovered: given t and
+    phi_t, where (hull-grid coordinates [N, 3]) carriers are born beyond the shell, for pixels without any. landed: given t, where
     carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3]. simulation: makes
     one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
     """
@@ -72,6 +73,7 @@ class Tracking:
     settings: CarrierSettings
     seed: int
     seen: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    uncovered: Callable[[int, np.ndarray], np.ndarray] | None = None
     landed: Callable[[int, np.ndarray, np.ndarray], np.ndarray] | None = None
     simulation: Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation] | None = None
 
@@ -135,6 +137,8 @@ class CarrierTracker:
         new = newborns(phi, tracking.grid, float(self._ratio), self._x, settings.shell, rng)
         if tracking.seen is not None:
             new = new[tracking.seen(phi, new * self._ratio)]
+        if tracking.uncovered is not None:
+            new = np.concatenate([new, tracking.uncovered(t, phi) / self._ratio])
         self._ids = np.concatenate([self._ids, np.arange(born, born + len(new), dtype=np.int32)])
         self._x = np.concatenate([self._x, new])
         self._F = np.concatenate([self._F, np.broadcast_to(np.eye(3, dtype=np.float32), (len(new), 3, 3))])

@@ -1,7 +1,7 @@
 """Which carriers the container hides from a camera: they are not drawn, and do not explain what a view shows.
 
-Decided per carrier and view, by the container's depth at the carrier's centre; `splashbench.observe.occlusion` does the
-same for carving. The paper composites by the depth of Gaussians alone.
+Decided per carrier and view, by the container's depth at the four pixels about the carrier's centre, so that a rim cuts
+through pixels. `splashbench.observe.occlusion` is the same for carving. The paper composites by the depth of Gaussians alone.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
-from splashbench.observe.container import depth_image, hidden
+from splashbench.observe.container import depth_image, hidden_share
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
@@ -41,8 +41,8 @@ class LiquidOcclusion:
         return self._depths[id(camera)][1]
 
     def hidden(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """bool [n]: whether `points` [n, 3] (scene units) lie behind the container for `camera`."""
-        return hidden(points, self.depth(camera), camera, self.tolerance)
+        """float32 [n] in [0, 1]: how far `points` [n, 3] (scene units) lie behind the container for `camera`."""
+        return hidden_share(points, self.depth(camera), camera, self.tolerance)
 
     def save(self, directory: Path) -> None:
         """Write container.npz into `directory`."""

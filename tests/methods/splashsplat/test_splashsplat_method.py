@@ -285,10 +285,11 @@ def test_the_paper_preset_is_the_papers():
     assert (velocity.smooth, velocity.smoothing, velocity.smoothing_unit) == ("field", 0.6, "transport")
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
+    assert (shell.interior_per_cell, paper.coverage_reach) == (None, 0)
     assert (paper.decoder.feature_size, paper.decoder.children, paper.decoder.scale_residual) == (32, 2, "linear")
     assert (paper.silhouette_norm, paper.composition, paper.between_frames) == ("image", "together", "forward")
     # What the paper does not say is as its README's table of constants has it.
     assert (paper.base_scale, paper.decoder.offset_bound, paper.decoder.opacity_band) == (0.35, 1.0, 3.0)
     best = SplashSplatConfig()
-    assert (best.base_scale, best.decoder.offset_bound, best.decoder.opacity_band) == (0.5, 3.0, 7.0)
+    assert (best.base_scale, best.decoder.offset_bound, best.decoder.opacity_band) == (0.5, 3.0, 20.0)
     assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)

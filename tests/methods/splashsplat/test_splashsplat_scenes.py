@@ -151,7 +151,9 @@ def test_two_training_views_are_enough(balls_copy: Path):
 def test_without_gravity_the_best_preset_leaves_out_what_needs_it(balls_copy: Path):
     cut(balls_copy, 3)
     change(balls_copy, gravity=None, metres_per_unit=None)
-    assert_at_the_balls(fit(balls_copy, "best"), balls_copy, median=0.005, near=0.75, iou=0.7)
+    # The usual shell: a deep one fills what the hull has too much, and twelve iterations make nothing transparent.
+    fitted = fit(balls_copy, "best", shell_depth=4.0)
+    assert_at_the_balls(fitted, balls_copy, median=0.005, near=0.75, iou=0.7)
 
 
 def test_flip_without_gravity_says_what_is_missing(balls_copy: Path):
