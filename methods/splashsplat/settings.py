@@ -102,6 +102,8 @@ class SplashSplatConfig(MethodConfig):
     offset_bound: PositiveFloat = 3.0
     #: depth below the surface at which opacity has faded to half, in transport voxels
     opacity_band: PositiveFloat = 20.0
+    #: the logit of every Gaussian's opacity at the start
+    opacity_bias: float = -1.0
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
@@ -173,6 +175,7 @@ class SplashSplatConfig(MethodConfig):
             "base_scale": 0.35,
             "offset_bound": 1.0,
             "opacity_band": 3.0,
+            "opacity_bias": 1.0,
             "silhouette_weight": 0.7,
             "scale_residual": "linear",
             "iterations": 3000,
@@ -273,6 +276,7 @@ class SplashSplatConfig(MethodConfig):
             children=self.children,
             offset_bound=self.offset_bound,
             opacity_band=self.opacity_band,
+            opacity_bias=self.opacity_bias,
             scale_residual=self.scale_residual,
         )
 

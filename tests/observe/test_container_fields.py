@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from splashbench.observe import Bounds, ContainerOcclusion, Grid, Silhouettes, sequence_bounds, signed_distance_fields
-from splashbench.observe.container import depth_image, hidden, solid_distance
+from splashbench.observe.container import depth_image, hidden, hidden_share, solid_distance
 from splashbench.observe.occlusion import CarvingOcclusion
 from splashbench.scene import Camera, ContainerMesh, look_at
 
@@ -126,6 +126,24 @@ def test_points_behind_the_wall_are_hidden(wall: ContainerOcclusion) -> None:
     depth = depth_image(wall.mesh, camera)
     points = np.array([[0, -0.2, 0], [0, 0.2, 0], [0.7, -0.2, 0], [0.5, -0.2, 0], [0, -9, 0], [5.0, 0, 0]])
     assert hidden(points, depth, camera, 0.06).tolist() == [True, False, False, False, False, False]
+
+
+def test_near_an_outline_a_point_is_hidden_by_as_much_of_its_pixel_as_the_wall_covers() -> None:
+    camera = BallBehindAWall().cameras["4"]
+    depth = np.full((200, 240), np.inf, np.float32)
+    depth[:, :100] = 1.0  # a wall up to column 100
+
+    def at(u: float, v: float, z: float) -> list[float]:
+        ray = np.linalg.inv(camera.K) @ [u, v, 1.0]
+        return (camera.w2c[:3, :3].T @ (z * ray) + camera.center).tolist()
+
+    columns = [90.0, 99.5, 99.75, 100.0, 100.25, 100.5, 150.0]
+    shares = hidden_share(np.array([at(u, 80.3, 2.0) for u in columns]), depth, camera, 0.1)
+    np.testing.assert_allclose(shares, [1, 1, 0.75, 0.5, 0.25, 0, 0], atol=1e-4)
+    # In front of the wall, within its tolerance, behind the camera, beside the image, in its corner pixels.
+    places = [(50, 80, 0.5), (50, 80, 1.05), (50, 80, -2.0), (-3, 80, 2.0), (0.1, 0.1, 2.0), (0.1, 199.9, 2.0)]
+    others = [at(*place) for place in places]
+    assert hidden_share(np.array(others), depth, camera, 0.1).tolist() == [0, 0, 0, 0, 1, 1]
 
 
 def recall_and_excess(scene: BallBehindAWall, container: ContainerOcclusion | None) -> tuple[float, float]:

@@ -115,10 +115,10 @@ def collect_targets(
 
     backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
     its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
-    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). frozen: of each view, Gaussians of the
-    background that are drawn together with the liquid's. silhouette_norm: the silhouette term averages over the
-    "image", as in the paper, whose images are crops about the liquid; or over the "window" around all masks of the
-    view, such a crop of images that are none; or over the "mask".
+    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). frozen: of each view,
+    Gaussians of the background that are drawn together with the liquid's. silhouette_norm: the silhouette term
+    averages over the "image", as in the paper, whose images are crops about the liquid; or over the "window" around
+    all masks of the view, such a crop of images that are none; or over the "mask".
     """
     frozen = frozen or {}
     targets = []

@@ -63,9 +63,9 @@ class Tracking:
 
     hull_grid: of phi_t. grid: the transport grid, of carriers and motion. seen: given phi_t and hull-grid coordinates
     [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. uncovered: given t and
-    phi_t, where (hull-grid coordinates [N, 3]) carriers are born beyond the shell, for pixels without any. landed: given t, where
-    carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3]. simulation: makes
-    one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
+    phi_t, where (hull-grid coordinates [N, 3]) carriers are born beyond the shell, for pixels without any. landed:
+    given t, where carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3].
+    simulation: makes one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
     """
 
     hull_grid: Grid

@@ -1,7 +1,8 @@
 """Which carriers the container hides from a camera: they are not drawn, and do not explain what a view shows.
 
 Decided per carrier and view, by the container's depth at the four pixels about the carrier's centre, so that a rim cuts
-through pixels. `splashbench.observe.occlusion` is the same for carving. The paper composites by the depth of Gaussians alone.
+through pixels. `splashbench.observe.occlusion` is the same for carving. The paper composites by the depth of Gaussians
+alone.
 """
 
 from __future__ import annotations
