@@ -150,6 +150,7 @@ def carve_view(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carve_hidden_view(
     phi: np.ndarray,
+    witnesses: np.ndarray,
     origin: np.ndarray,
     voxel: float,
     projection: np.ndarray,
@@ -160,23 +161,24 @@ def _carve_hidden_view(
     starts: np.ndarray,
     tolerance: float,
     limit: float,
-    behind: float,
     start: int,
     stop: int,
 ) -> None:
     _, ny, nz = phi.shape
     last, height, width = layers.shape[0] - 1, layers.shape[1], layers.shape[2]
+    counting = witnesses.shape[1] > 0
     for i in range(start, stop):
         x = origin[0] + i * voxel
         for j in range(ny):
             y = origin[1] + j * voxel
             for k in range(nz):
-                if phi[i, j, k] >= limit:
+                if not counting and phi[i, j, k] >= limit:
                     continue
                 z = origin[2] + k * voxel
                 depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
                 if depth <= 0.0:
-                    phi[i, j, k] = max(phi[i, j, k], behind)
+                    if not counting:
+                        phi[i, j, k] = limit
                     continue
                 u = projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]
                 v = projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]
@@ -201,7 +203,16 @@ def _carve_hidden_view(
                     image[row + 1, column] * (1 - a) + image[row + 1, column + 1] * a
                 ) * b
                 distance = min(max((pixels + beyond) * depth / (focal * voxel), -limit), limit)
-                phi[i, j, k] = max(phi[i, j, k], distance)
+                if not counting:
+                    phi[i, j, k] = max(phi[i, j, k], distance)
+                elif distance > phi[i, j, k]:
+                    witnesses[i, j, k] = phi[i, j, k]
+                    phi[i, j, k] = distance
+                elif distance > witnesses[i, j, k]:
+                    witnesses[i, j, k] = distance
+
+
+_NOT_COUNTING = np.zeros((1, 0, 1), dtype=np.float32)
 
 
 def carve_hidden_view(
@@ -216,7 +227,7 @@ def carve_hidden_view(
     starts: np.ndarray,
     tolerance: float,
     limit: float,
-    behind: float,
+    second: np.ndarray | None = None,
 ) -> None:
     """As `carve_view`, for a view from which an occluder hides what lies more than `tolerance` behind it.
 
@@ -224,12 +235,14 @@ def carve_hidden_view(
     depths from starts[k - 1] on (starts: [K], scene units, rising). nearest: float32 [h, w], depth of the occluder. A
     point that is hidden at its own depth looks one layer deeper, where its pixel is hidden too.
 
-    behind: the value, in voxels, of what lies behind the camera.
+    second: float32 [nx, ny, nz]; where given, phi collects the largest and `second` the second largest value of all
+    views that are added one after the other, instead of the maximum alone.
     """
     over_range(
         _carve_hidden_view,
         phi.shape[0],
         phi,
+        _NOT_COUNTING if second is None else second,
         np.ascontiguousarray(origin, np.float64),
         float(voxel),
         np.ascontiguousarray(projection, np.float64),
@@ -240,5 +253,4 @@ def carve_hidden_view(
         np.ascontiguousarray(starts, np.float64),
         float(tolerance),
         float(limit),
-        float(behind),
     )

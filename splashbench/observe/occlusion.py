@@ -1,6 +1,6 @@
 """Carving around a container: a view is no evidence about what the container hides, and walls hold no liquid.
 
-A view whose line of sight to x the container blocks says nothing about x. One view at least must see x.
+A view whose line of sight to x the container blocks says nothing about x. One view at least must see x all the same.
 In a view the hidden pixels join the silhouette, at each depth those that are hidden there. So phi keeps its sub-voxel
 outline where the view sees, and does not break off where the container begins.
 """
@@ -8,6 +8,7 @@ outline where the view sees, and does not break off where the container begins.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -123,8 +124,8 @@ class ViewOcclusion:
             layers[layer] = np.where(either & ~outlined, -inner_distance(either), joined)
         return layers
 
-    def carve(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, behind: float = LIMIT_VOXELS) -> None:
-        """phi = max(phi, what `layers` say, or `behind` the camera), in place, in voxels of `grid`."""
+    def carve(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, second: np.ndarray | None = None) -> None:
+        """phi = max(phi, what `layers` say), in place, in voxels of `grid`; see `carve_hidden_view`."""
         carve_hidden_view(
             phi,
             grid.origin,
@@ -137,7 +138,7 @@ class ViewOcclusion:
             self.starts,
             _TOLERANCE_VOXELS * grid.voxel,
             LIMIT_VOXELS,
-            behind,
+            second,
         )
 
 
@@ -145,25 +146,30 @@ class CarvingOcclusion:
     """A `ContainerOcclusion` made ready for the views of `silhouettes` on `grid`.
 
     Attributes:
-        outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say.
+        outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say: in walls, below the
+            container's foot, and where fewer views than `witnesses` see anything.
         views: what it hides from each view; empty for a container that hides nothing.
     """
 
-    def __init__(self, container: ContainerOcclusion, silhouettes: Silhouettes, grid: Grid) -> None:
+    def __init__(
+        self, container: ContainerOcclusion, silhouettes: Silhouettes, grid: Grid, witnesses: Literal[1, 2] = 1
+    ) -> None:
+        """witnesses: views that have to see a place.
+
+        One is enough to reconstruct: a rim hides the edge of a pool from all views but one, and what that view shows
+        there is liquid. Two are for those who hold views against each other.
+        """
         self.outside = container.forbidden(grid)
         self.views: list[ViewOcclusion] = []
         if container.hides:
             for camera, window in zip(silhouettes.cameras, silhouettes.windows):
                 self.views.append(ViewOcclusion(camera, container.mesh, window))
-            np.maximum(self.outside, -self._seen(grid), out=self.outside)
+            np.maximum(self.outside, -self._seen(grid)[witnesses - 1], out=self.outside)
 
-    def _seen(self, grid: Grid) -> np.ndarray:
-        """Voxels by which a node lies within what a view sees; < 0 where none does.
-
-        One view is enough. A rim hides the edge of a pool from all views but one, and what that view shows there is
-        liquid: asking two of them to see it cost .1 to .5 dB on bowls.
-        """
-        seen = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32)
+    def _seen(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Voxels by which a node lies within what at least one view sees, and two; < 0 where fewer do."""
+        best = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32)
+        second = best.copy()
         for view in self.views:
-            view.carve(seen, grid, view.visibility(), behind=-LIMIT_VOXELS)
-        return seen
+            view.carve(best, grid, view.visibility(), second)
+        return best, second

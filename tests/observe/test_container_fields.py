@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import trimesh
@@ -187,19 +189,20 @@ def test_nothing_is_liquid_in_a_wall_or_below_the_foot() -> None:
     assert sequence_bounds(scene, floor).low[1] == pytest.approx(0.1, abs=0.01)
 
 
-def test_one_view_must_see_a_point() -> None:
+def test_a_view_must_see_a_point_and_two_where_asked_for() -> None:
     scene = BallBehindAWall()
     grid = Grid.over(Bounds(np.full(3, -0.3), np.full(3, 0.3)), 24)
 
-    def seen(*walls: tuple) -> bool:
+    def seen(*walls: tuple, witnesses: Literal[1, 2] = 1) -> bool:
         shape = trimesh.util.concatenate([trimesh.creation.box(bounds=wall) for wall in walls])
-        outside = CarvingOcclusion(ContainerOcclusion(mesh_of(shape)), Silhouettes(scene), grid).outside
+        outside = CarvingOcclusion(ContainerOcclusion(mesh_of(shape)), Silhouettes(scene), grid, witnesses).outside
         assert (outside > 0).all() or (outside < 0).all()
         return bool((outside < 0).all())
 
     right, front, back = ((0.5, -2, -2), (0.55, 2, 2)), ((-2, -2, -0.55), (2, 2, -0.5)), ((-2, -2, 0.5), (2, 2, 0.55))
-    assert seen(right)  # from cameras 3 and 4
+    assert seen(right, witnesses=2)  # from cameras 3 and 4
     assert seen(right, front)  # from camera 4 alone
+    assert not seen(right, front, witnesses=2)
     assert not seen(right, front, back)
 
 

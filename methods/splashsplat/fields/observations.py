@@ -32,7 +32,7 @@ from .occlusion import LiquidOcclusion
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 4
+_REVISION = 5
 
 
 @dataclass(frozen=True)
