@@ -107,7 +107,7 @@ class SplashSplatConfig(MethodConfig):
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
-    iterations: int = Field(4000, ge=0)
+    iterations: int = Field(6000, ge=0)
     learning_rate_features: PositiveFloat = 0.06
     learning_rate_cells: PositiveFloat = 0.02
     learning_rate_heads: PositiveFloat = 0.015
@@ -116,7 +116,7 @@ class SplashSplatConfig(MethodConfig):
     feature_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
     anneal: bool = True
     #: share of the photographs by whose loss the fit stops before `iterations`, and which it leaves out; 0 never stops
-    validation_share: float = Field(0.04, ge=0, le=0.1)
+    validation_share: float = Field(0.0, ge=0, le=0.1)
     stop_gain: float = Field(0.01, ge=0, lt=1)
     ssim_every: PositiveInt = 1
     #: what the silhouette term is averaged over: the "image", the "window" around all masks of the view, or the "mask"
@@ -200,6 +200,7 @@ class SplashSplatConfig(MethodConfig):
             "max_per_cell": 4,
             "shell_outside": 0.125,
             "iterations": 800,
+            "validation_share": 0.04,
             "ssim_every": 2,
             "background_preset": "quick",
         },
