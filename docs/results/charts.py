@@ -265,6 +265,28 @@ def transport() -> Figure:
     return figure
 
 
+def told_nothing() -> Figure:
+    rows = read(HERE / "data" / "told_nothing.csv")
+    figures = {(row["row"], row["scene"], row["metric"]): float(row["value"]) for row in rows}
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure = Figure(figsize=(9.2, 2.8), layout="constrained")
+    places = figure.subplots(1, 3, sharey=True)
+    marks = (
+        ("splashsplat version 4", "o", VERMILION, "white"),
+        ("scaffold_4d", "D", BLUE, BLUE),
+        ("splashsplat", "o", VERMILION, VERMILION),
+    )
+    panels = (("psnr", "PSNR of the liquid, dB →"), ("lpips", "← LPIPS"), ("jitter_error", "← jitter error"))
+    for place, (metric, title) in zip(places, panels):
+        for name, marker, edge, face in marks:
+            values = [figures[name, scene, metric] for scene in scenes]
+            place.plot(values, range(len(scenes)), marker, mec=edge, mfc=face, ms=6, label=name)
+        named_rows(place, scenes)
+        place.set_title(title)
+    legend(places[-1])
+    return figure
+
+
 def whole_fit() -> Figure:
     rows = read(HERE / "data" / "by_scene.csv")
     phases = {row["metric"]: float(row["value"]) for row in rows if row["study"] == "whole_fit"}
@@ -293,6 +315,7 @@ CHARTS: dict[str, Callable[[], Figure]] = {
     ),
     "carriers": carriers,
     "transport": transport,
+    "told_nothing": told_nothing,
     "whole_fit": whole_fit,
 }
 

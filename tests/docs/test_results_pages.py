@@ -52,6 +52,25 @@ def test_the_switches_are_the_studys() -> None:
             )
 
 
+def test_told_nothing_is_what_was_measured() -> None:
+    with (RESULTS / "data" / "told_nothing.csv").open(encoding="utf-8", newline="") as file:
+        measured = {(row["scene"], row["row"], row["metric"]): float(row["value"]) for row in csv.DictReader(file)}
+    table = first_table("told_nothing.md")
+    metrics = ("psnr", "lpips", "miou", "spill", "jitter_error")
+    places = (2, 4, 3, 3, 4)
+    names = ("splashsplat", "scaffold_4d", "splashsplat version 4")
+    scenes = [line[0] for line in table[2:-1]]
+    assert sorted(scenes) == sorted({scene for scene, _, _ in measured})
+    for scene, *cells in [[scene, *line[1:]] for scene, line in zip(scenes, table[2:-1])]:
+        for name, cell in zip(names, cells):
+            found = [float(part.strip(" *†")) for part in cell.split("/")]
+            assert found == [pytest.approx(measured[scene, name, metric], abs=1e-9) for metric in metrics]
+    for name, cell in zip(names, table[-1][1:]):
+        for part, metric, digits in zip(cell.split("/"), metrics, places):
+            mean = sum(measured[scene, name, metric] for scene in scenes) / len(scenes)
+            assert float(part.strip(" *†")) == pytest.approx(mean, abs=0.51 * 10**-digits)
+
+
 @pytest.mark.parametrize(
     ("label", "metric", "scale"),
     [
