@@ -61,7 +61,7 @@ class BackgroundSettings(MethodConfig):
 
     frames: Literal["all", "first"] = "all"
     start: Literal["pixels", "points"] = "pixels"
-    iterations: int = Field(default=1500, ge=1, le=1_000_000)
+    iterations: int = Field(default=1000, ge=1, le=1_000_000)
     max_anchors: int = Field(default=15_000, ge=10, le=5_000_000)
     children: int = Field(default=2, ge=1, le=32)
     longest_side: int = Field(default=800, ge=16, le=16384)

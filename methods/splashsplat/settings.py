@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "6"
+VERSION = "7"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -93,7 +93,9 @@ class SplashSplatConfig(MethodConfig):
     #: no carriers where no training view can see them
     visible_only: bool = True
     # Decoder
-    feature_size: PositiveInt = 32
+    feature_size: PositiveInt = 16
+    #: hidden units of the colour head
+    color_width: PositiveInt = 32
     #: Gaussians of a carrier
     children: int = Field(1, ge=1, le=6)
     #: extent of a Gaussian at the start, in transport voxels
@@ -132,7 +134,8 @@ class SplashSplatConfig(MethodConfig):
     covariance_weight: float = Field(0.01, ge=0)
     separation_weight: float = Field(0.1, ge=0)
     color_weight: float = Field(1.0, ge=0)
-    #: carriers whose learned opacity ends below this are dropped; 0 keeps all
+    #: carriers whose learned opacity falls below this are dropped, eight times during the fit and at its end; 0 keeps
+    #: all
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
@@ -178,6 +181,8 @@ class SplashSplatConfig(MethodConfig):
             "opacity_bias": 1.0,
             "silhouette_weight": 0.7,
             "scale_residual": "linear",
+            "feature_size": 32,
+            "color_width": 64,
             "iterations": 3000,
             "learning_rate_features": 2e-3,
             "learning_rate_heads": 2e-3,
@@ -274,6 +279,7 @@ class SplashSplatConfig(MethodConfig):
     def decoder(self) -> DecoderSettings:
         return DecoderSettings(
             feature_size=self.feature_size,
+            color_width=self.color_width,
             children=self.children,
             offset_bound=self.offset_bound,
             opacity_band=self.opacity_band,
@@ -295,6 +301,7 @@ class SplashSplatConfig(MethodConfig):
             stop_gain=self.stop_gain,
             ssim_every=self.ssim_every,
             base_scale=self.base_scale,
+            prune_opacity=self.prune_opacity,
             weights=LossWeights(
                 foreground=self.foreground_weight,
                 gradient=self.gradient_weight,

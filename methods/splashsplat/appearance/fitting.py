@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -22,7 +22,8 @@ from splashbench.scene.camera import Camera
 from ..carriers.subframe import Track
 from ..kernel.window_loss import window_losses
 from . import losses
-from .decoder import Children, ColorCells, Decoder, DecoderSettings, Penalties, initial_log_scale
+from .active import Active, ActiveCarriers
+from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .optimizer import RowAdam
 from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
 from .shared_features import SharedFeatures
@@ -35,6 +36,9 @@ Composition = Literal["over", "together"]
 _LOOK_EVERY = 100
 # Iterations in which the learning rates fall, as a share of those before.
 _FALL = 0.5
+# When transparent carriers are left out, as shares of the iterations: before the rates have fallen, as what is fitted
+# beside them has to make up for them.
+_PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,9 @@ class FitSettings:
     iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
     anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. validation_share: of the
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
-    `AdaptiveSchedule`. feature_cells: see `SharedFeatures`; learning_rate_cells is that of the shared parts.
+    `AdaptiveSchedule`. prune_opacity: carriers whose learned opacity is below this at one of `_PRUNINGS` are not
+    fitted any further; 0 fits all to the end. feature_cells: see `SharedFeatures`; learning_rate_cells is that of the
+    shared parts.
     """
 
     iterations: int = 1000
@@ -58,6 +64,7 @@ class FitSettings:
     anneal: bool = True
     ssim_every: int = 1
     base_scale: float = 0.35
+    prune_opacity: float = 0.0
     weights: losses.LossWeights = field(default_factory=losses.LossWeights)
 
 
@@ -127,13 +134,6 @@ def penalty_loss(penalties: Penalties, voxel: float, weights: losses.LossWeights
     )
 
 
-def _color_cells(track: Track, t: int, size: float) -> ColorCells:
-    """The cells of frame `t`'s carriers, of `size` transport voxels."""
-    keys = np.floor(track.carriers.positions[track.carriers.rows(t)] / size).astype(np.int64)
-    _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    return ColorCells(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(counts.astype(np.float32)))
-
-
 def fit_appearance(
     appearance: Appearance,
     track: Track,
@@ -147,9 +147,7 @@ def fit_appearance(
 
     Raises SplashbenchError where the loss stops being finite.
     """
-    frames = range(track.carriers.n_frames)
-    states, ids = [track.state(t) for t in frames], [track.ids(t) for t in frames]
-    cells = [_color_cells(track, t, color_cell) for t in frames]
+    carriers = ActiveCarriers(track, color_cell)
     decoder = appearance.decoder
     parameters = list(decoder.parameters())
     heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
@@ -157,7 +155,7 @@ def fit_appearance(
     features = SharedFeatures(
         appearance.features,
         track.carriers,
-        ids,
+        carriers.ids,
         settings.feature_cells,
         settings.learning_rate_features,
         settings.learning_rate_cells,
@@ -174,28 +172,27 @@ def fit_appearance(
             schedule = adaptive
 
     def seen(
-        target: TrainingTarget, frame_features: Tensor, frame_scales: Tensor, penalised: bool
+        target: TrainingTarget, active: Active, values: list[Tensor], penalised: bool
     ) -> tuple[Tensor, Tensor, Penalties | None]:
-        # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
-        state = track.state(target.frame, target.fraction) if target.fraction else states[target.frame]
-        state = replace(state, visibility=target.visibility)
-        of_cells = cells[target.frame] if penalised else None
-        children, penalty_terms = decoder.decode(frame_features, frame_scales, None, state, target.eye, of_cells)
+        cells = active.cells if penalised else None
+        children, penalty_terms = decoder.decode(values[0], values[1], None, active.state, target.eye, cells)
         images = composite(children, target.camera, target.background, target.frozen, target.modes)
         return *images, penalty_terms
 
-    def of_frame(t: int) -> tuple[Tensor, Tensor]:
-        return features.of_frame(t), appearance.log_scales.index_select(0, ids[t])
+    def learned(t: int, active: Active) -> list[Tensor]:
+        return [features.of_frame(t, active.places), appearance.log_scales.index_select(0, active.ids)]
 
     @torch.no_grad()
     def loss_of_withheld() -> float:
         weights, total = settings.weights, 0.0
         for number in np.nonzero(withheld_targets)[0]:
             target = targets[number]
-            image, alpha, _ = seen(target, *of_frame(target.frame), penalised=False)
+            active = carriers.of(target)
+            image, alpha, _ = seen(target, active, learned(target.frame, active), penalised=False)
             total += float(image_loss(image, alpha, target, weights, weights.ssim))
         return total / int(withheld_targets.sum())
 
+    prunings = {round(share * settings.iterations) for share in _PRUNINGS}
     queue: list[int] = []
     history: list[float] = []
     iteration = 0
@@ -208,9 +205,14 @@ def fit_appearance(
         if not queue:
             fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
+        if settings.prune_opacity > 0 and iteration in prunings:
+            looks = Appearance(features.all(), appearance.log_scales, decoder)
+            carriers.drop(torch.from_numpy(~visible_carriers(looks, settings.prune_opacity)))
+            features.keep(carriers.ids)
         target = targets[queue.pop()]
-        active = [values.requires_grad_() for values in of_frame(target.frame)]
-        image, alpha, penalty_terms = seen(target, active[0], active[1], penalised=True)
+        active = carriers.of(target)
+        values = [table.requires_grad_() for table in learned(target.frame, active)]
+        image, alpha, penalty_terms = seen(target, active, values, penalised=True)
         assert penalty_terms is not None
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
@@ -221,14 +223,14 @@ def fit_appearance(
             raise SplashbenchError(
                 f"the loss of splashsplat is {history[-1]} at iteration {iteration + 1}; lower the learning rates"
             )
-        by_feature, by_scale, *by_head = torch.autograd.grad(loss, [*active, *parameters])
+        by_feature, by_scale, *by_head = torch.autograd.grad(loss, [*values, *parameters])
         for parameter, gradient in zip(parameters, by_head):
             parameter.grad = gradient
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
-        features.step(target.frame, by_feature, factor)
-        scales.step(ids[target.frame], by_scale, factor)
+        features.step(target.frame, by_feature, factor, active.places)
+        scales.step(active.ids, by_scale, factor)
         iteration += 1
         progress(schedule.done(iteration))
     appearance.features = features.all()

@@ -9,13 +9,14 @@ decoder and files know nothing of them. Not in the paper.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..carriers.population import Carriers
+from .active import chosen
 from .optimizer import RowAdam
 
 
@@ -60,24 +61,31 @@ class SharedFeatures:
         for size in sizes:
             cells = torch.from_numpy(cells_of(born, size, rng.random(4)))
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
-            cells_of_frames = [torch.unique(cells.index_select(0, ids), return_inverse=True) for ids in self._ids]
-            rows, members = [rows for rows, _ in cells_of_frames], [members for _, members in cells_of_frames]
-            self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), rows, members))
+            self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), *_by_frame(cells, ids)))
 
-    def of_frame(self, t: int) -> Tensor:
-        """Features of the carriers of frame `t`, [n, width]."""
-        return self._sum(self._ids[t])
+    def keep(self, ids: list[Tensor]) -> None:
+        """Go on with the carriers `ids` of each frame alone."""
+        self._ids = ids
+        self._levels = [
+            replace(level, rows=rows, members=members)
+            for level in self._levels
+            for rows, members in [_by_frame(level.cells, ids)]
+        ]
+
+    def of_frame(self, t: int, places: Tensor | None = None) -> Tensor:
+        """Features of the carriers of frame `t` [n, width], or of those at `places` (int64 [n]) among them."""
+        return self._sum(chosen(self._ids[t], places))
 
     def all(self) -> Tensor:
         """Features of all carriers, [count, width]."""
         return self._sum(torch.arange(len(self._own)))
 
-    def step(self, t: int, gradient: Tensor, factor: float) -> None:
-        """Descend along the `gradient` [n, width] of frame `t`'s features; `factor` scales the rates."""
-        self._adam.step(self._ids[t], gradient, factor)
+    def step(self, t: int, gradient: Tensor, factor: float, places: Tensor | None = None) -> None:
+        """Descend along the `gradient` [n, width] of what `of_frame` gave; `factor` scales the rates."""
+        self._adam.step(chosen(self._ids[t], places), gradient, factor)
         for level in self._levels:
-            rows = level.rows[t]
-            summed = gradient.new_zeros(len(rows), gradient.shape[1]).index_add_(0, level.members[t], gradient)
+            rows, members = level.rows[t], chosen(level.members[t], places)
+            summed = gradient.new_zeros(len(rows), gradient.shape[1]).index_add_(0, members, gradient)
             level.adam.step(rows, summed, factor)
 
     def _sum(self, ids: Tensor) -> Tensor:
@@ -85,6 +93,12 @@ class SharedFeatures:
         for level in self._levels:
             features += level.table.index_select(0, level.cells.index_select(0, ids))
         return features
+
+
+def _by_frame(cells: Tensor, ids: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """Per frame, with carriers `ids`: the cells that they are in, ascending, and which of these each is in."""
+    found = [torch.unique(cells.index_select(0, of_frame), return_inverse=True) for of_frame in ids]
+    return [rows for rows, _ in found], [members for _, members in found]
 
 
 def births(carriers: Carriers) -> np.ndarray:

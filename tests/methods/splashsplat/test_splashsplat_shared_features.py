@@ -58,6 +58,25 @@ def test_a_step_moves_the_carriers_own_part_and_its_cells() -> None:
     torch.testing.assert_close(features.of_frame(1), features.all()[[1, 2]])
 
 
+def test_a_step_may_be_of_some_carriers_alone() -> None:
+    features, _ = _features(1e6)
+    before = features.all()
+    torch.testing.assert_close(features.of_frame(0, torch.tensor([1])), before[[1]])
+    features.step(0, torch.tensor([[1.0, -1.0]]), factor=1.0, places=torch.tensor([1]))
+    expected = torch.tensor([[-0.02, 0.02], [-0.08, 0.08], [-0.02, 0.02], [-0.02, 0.02]])
+    torch.testing.assert_close(features.all() - before, expected)
+
+
+def test_a_step_leaves_alone_the_cells_that_no_kept_carrier_is_in() -> None:
+    features, _ = _features(4.0)
+    before = features.all()
+    features.keep([torch.tensor([0]), torch.tensor([2]), torch.tensor([2])])
+    torch.testing.assert_close(features.of_frame(1), before[[2]])
+    features.step(1, torch.tensor([[1.0, -1.0]]), factor=1.0)
+    moved = (features.all() - before).abs().amax(dim=1)
+    assert moved.tolist() == pytest.approx([0, 0, 0.08, 0], abs=1e-6)
+
+
 def test_a_cell_descends_along_the_sum_of_its_carriers() -> None:
     features, _ = _features(1e6)
     before = features.all()

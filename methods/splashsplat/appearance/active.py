@@ -1,0 +1,97 @@
+"""Which carriers of a frame one photograph teaches: those that its view may see, and that are not transparent yet.
+
+The shell below the hull's surface is deep, and much of it is phantom volume. The images make its carriers transparent
+within the first part of the fit, and decoding them on would cost as much as decoding the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..carriers.subframe import CarrierState, Track
+from .decoder import ColorCells
+from .targets import TrainingTarget
+
+# `TrainingTarget.hidden` of carriers that the container hides as a whole.
+_HIDDEN = 255
+
+
+@dataclass(frozen=True)
+class Active:
+    """n carriers that a photograph teaches. ids: int64 [n], their rows in the tables. places: int64 [n] among the
+    frame's own that are left, or None for all of these. state: of the instant. cells: for the colour penalty."""
+
+    ids: Tensor
+    places: Tensor | None
+    state: CarrierState
+    cells: ColorCells
+
+
+class ActiveCarriers:
+    """The carriers of every frame of `track` that are left; all of them at first.
+
+    color_cell: edge of the colour penalty's cells, transport voxels. ids: int64 [n] of each frame, rows of the tables;
+    another list after `drop`.
+    """
+
+    def __init__(self, track: Track, color_cell: float) -> None:
+        self._track = track
+        frames = range(track.carriers.n_frames)
+        self.ids = [track.ids(t) for t in frames]
+        # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
+        self._states = [track.state(t) for t in frames]
+        self._cells = [_cells(track, t, color_cell) for t in frames]
+        # Of each frame's carriers in the track those that are left; None for all.
+        self._left: list[Tensor | None] = [None for _ in frames]
+
+    def of(self, target: TrainingTarget) -> Active:
+        """What `target` teaches."""
+        t = target.frame
+        state, left = self._states[t], self._left[t]
+        if target.fraction:
+            state = _part(self._track.state(t, target.fraction), left)
+        places: Tensor | None = None
+        if target.hidden is not None and target.visibility is not None:
+            state = replace(state, visibility=chosen(target.visibility, left))
+            seen = chosen(target.hidden, left) < _HIDDEN
+            if not bool(seen.all()):
+                places = seen.nonzero()[:, 0]
+        state = _part(state, places)
+        numbers = chosen(self._cells[t], places)
+        sizes = torch.bincount(numbers).clamp_min(1).to(torch.float32)
+        return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes))
+
+    def drop(self, transparent: Tensor) -> None:
+        """Leave out the carriers `transparent` (bool [count]) from now on."""
+        self.ids = list(self.ids)
+        for t, ids in enumerate(self.ids):
+            left = (~transparent.index_select(0, ids)).nonzero()[:, 0]
+            before = self._left[t]
+            self._left[t] = left if before is None else before.index_select(0, left)
+            self.ids[t] = ids.index_select(0, left)
+            self._states[t] = _part(self._states[t], left)
+            self._cells[t] = self._cells[t].index_select(0, left)
+
+
+def _cells(track: Track, t: int, size: float) -> Tensor:
+    """The numbers of the cells, of `size` transport voxels, that frame `t`'s carriers are in: int64 [n]."""
+    keys = np.floor(track.carriers.positions[track.carriers.rows(t)] / size).astype(np.int64)
+    return torch.from_numpy(np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1))
+
+
+def chosen(values: Tensor, places: Tensor | None) -> Tensor:
+    """The rows of `values` at `places` (int64 [n]); all of them without."""
+    return values if places is None else values.index_select(0, places)
+
+
+def _part(state: CarrierState, places: Tensor | None) -> CarrierState:
+    return CarrierState(
+        chosen(state.positions, places),
+        chosen(state.deformation, places),
+        chosen(state.phi, places),
+        None if state.visibility is None else chosen(state.visibility, places),
+    )

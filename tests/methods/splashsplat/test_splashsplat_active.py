@@ -1,0 +1,114 @@
+"""Whom a photograph teaches: carriers that its view may see, as long as they are not transparent."""
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.observe.grid import Grid
+from splashbench.scene.camera import Camera, look_at
+from splashbench_methods.splashsplat.appearance.active import ActiveCarriers
+from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings
+from splashbench_methods.splashsplat.appearance.fitting import FitSettings, fit_appearance, initial_appearance
+from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
+from splashbench_methods.splashsplat.carriers.population import Carriers
+from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
+from splashbench_methods.splashsplat.motion.steps import Motion
+
+SIZE = 12
+
+
+def _track() -> Track:
+    """Two frames on a grid of unit voxels: carriers 0, 1 and 2 in the first, 1, 2 and 3 in the second. 0 and 1 are side
+    by side, 2 and 3 far off; all move one voxel along x."""
+    ids = np.array([0, 1, 2, 1, 2, 3], dtype=np.int32)
+    positions = np.array([[2, 2, 2], [3, 2, 2], [7, 2, 2], [4, 2, 2], [8, 2, 2], [7, 3, 2]], dtype=np.float32)
+    carriers = Carriers(
+        np.array([0, 3, 6]), ids, positions, np.tile(np.eye(3, dtype=np.float32), (6, 1, 1)), np.zeros(6, np.float32), 4
+    )
+    velocity = np.zeros((1, 7, 7, 7, 3), dtype=np.float32)
+    velocity[..., 0] = 1
+    grid = Grid(np.zeros(3), 1.0, (SIZE, SIZE, SIZE))
+    return Track(grid, carriers, Motion(velocity, 2, [None]), np.zeros((2, SIZE, SIZE, SIZE), dtype=np.int8))
+
+
+def _target(frame: int = 0, fraction: float = 0.0, hidden: list[int] | None = None) -> TrainingTarget:
+    """A white photograph of 16x16 pixels, taken from along z."""
+    camera = Camera("1", 16, 16, np.array([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), look_at((5, 2, -15), (5, 2, 0)))
+    white = torch.full((16, 16, 3), 255, dtype=torch.uint8)
+    return TrainingTarget(
+        frame=frame,
+        fraction=fraction,
+        camera=camera,
+        eye=torch.tensor(camera.center, dtype=torch.float32),
+        photograph=WindowPhotograph(white, torch.ones(16, 16, dtype=torch.bool), top=0, left=0),
+        background=torch.zeros(16, 16, 3),
+        area=256.0,
+        hidden=None if hidden is None else torch.tensor(hidden, dtype=torch.uint8),
+    )
+
+
+def test_all_carriers_are_taught_where_nothing_hides_them() -> None:
+    active = ActiveCarriers(_track(), color_cell=4.0).of(_target())
+    assert active.ids.tolist() == [0, 1, 2]
+    assert active.places is None
+    assert active.cells.of_carriers.tolist() == [0, 0, 1]
+    assert active.cells.sizes.tolist() == [2, 1]
+
+
+def test_a_carrier_that_is_hidden_as_a_whole_is_not_taught() -> None:
+    active = ActiveCarriers(_track(), color_cell=4.0).of(_target(hidden=[0, 255, 51]))
+    assert active.ids.tolist() == [0, 2]
+    assert active.places is not None
+    assert active.places.tolist() == [0, 2]
+    assert active.state.positions[:, 0].tolist() == [2, 7]
+    assert active.state.visibility is not None
+    np.testing.assert_allclose(active.state.visibility, [1, 0.8], rtol=1e-6)
+    assert active.cells.of_carriers.tolist() == [0, 1]
+    assert active.cells.sizes.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25])
+def test_dropped_carriers_are_left_out_at_any_instant(fraction: float) -> None:
+    carriers = ActiveCarriers(_track(), color_cell=4.0)
+    before = carriers.ids
+    carriers.drop(torch.tensor([False, True, False, False]))
+    active = carriers.of(_target(fraction=fraction, hidden=[0, 255, 51]))
+    assert active.ids.tolist() == [0, 2]
+    np.testing.assert_allclose(active.state.positions[:, 0], [2 + fraction, 7 + fraction], atol=1e-3)
+    assert active.state.visibility is not None
+    np.testing.assert_allclose(active.state.visibility, [1, 0.8], rtol=1e-6)
+    carriers.drop(torch.tensor([True, False, False, False]))
+    assert [ids.tolist() for ids in carriers.ids] == [[2], [2, 3]]
+    active = carriers.of(_target(fraction=fraction, hidden=[0, 255, 51]))
+    assert active.ids.tolist() == [2]
+    np.testing.assert_allclose(active.state.visibility, [0.8], rtol=1e-6)
+    assert [ids.tolist() for ids in before] == [[0, 1, 2], [1, 2, 3]]
+
+
+def _steps_of_sizes(prune_opacity: float) -> list[float]:
+    """How far each carrier's extent moved in twenty iterations on both frames, in Adam's steps; 1 is transparent from
+    the start."""
+    rate = 0.01
+    settings = FitSettings(
+        iterations=20,
+        feature_cells=(4.0,),
+        learning_rate_heads=1e-6,
+        learning_rate_scales=rate,
+        anneal=False,
+        prune_opacity=prune_opacity,
+    )
+    appearance = initial_appearance(4, 1.0, settings, DecoderSettings(feature_size=4, children=1), seed=0)
+    with torch.no_grad():
+        appearance.decoder.opacity.weight.copy_(torch.tensor([[8.0, 0, 0, 0]]))
+        appearance.features[:, 0] = torch.tensor([0.0, -1.0, 0.0, 0.0])
+    before = appearance.log_scales.clone()
+    fit_appearance(appearance, _track(), [_target(0), _target(1)], settings, 100.0, 0, lambda done: None)
+    return ((appearance.log_scales - before).abs().amax(dim=1) / rate).tolist()
+
+
+def test_a_transparent_carrier_is_not_fitted_any_further() -> None:
+    kept, dropped = _steps_of_sizes(0.0), _steps_of_sizes(0.01)
+    assert kept[1] > 10
+    assert 0 < dropped[1] < 2.5  # the two before the first look
+    assert min(dropped[0], dropped[2]) > 5
