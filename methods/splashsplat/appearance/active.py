@@ -14,10 +14,7 @@ from torch import Tensor
 
 from ..carriers.subframe import CarrierState, Track
 from .decoder import ColorCells
-from .targets import TrainingTarget
-
-# `TrainingTarget.hidden` of carriers that the container hides as a whole.
-_HIDDEN = 255
+from .targets import HIDDEN, TrainingTarget
 
 
 @dataclass(frozen=True)
@@ -54,14 +51,14 @@ class ActiveCarriers:
         state, left = self._states[t], self._left[t]
         if target.fraction:
             state = _part(self._track.state(t, target.fraction), left)
-        places: Tensor | None = None
-        if target.hidden is not None and target.visibility is not None:
-            state = replace(state, visibility=chosen(target.visibility, left))
-            seen = chosen(target.hidden, left) < _HIDDEN
-            if not bool(seen.all()):
-                places = seen.nonzero()[:, 0]
-        state = _part(state, places)
+        places, visibility = None, None
+        if target.hidden is not None:
+            hidden = chosen(target.hidden, left)
+            places = (hidden < HIDDEN).nonzero()[:, 0]
+            visibility = 1 - hidden.index_select(0, places).to(torch.float32) / HIDDEN
+        state = replace(_part(state, places), visibility=visibility)
         numbers = chosen(self._cells[t], places)
+        # Cells of which none is left count one, as nothing may be divided by zero.
         sizes = torch.bincount(numbers).clamp_min(1).to(torch.float32)
         return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes))
 
@@ -93,5 +90,4 @@ def _part(state: CarrierState, places: Tensor | None) -> CarrierState:
         chosen(state.positions, places),
         chosen(state.deformation, places),
         chosen(state.phi, places),
-        None if state.visibility is None else chosen(state.visibility, places),
     )

@@ -78,7 +78,10 @@ class Penalties:
 
 
 def penalties(children: Children, cells: ColorCells) -> Penalties:
-    """The penalties on children, in plain torch."""
+    """The penalties on children, in plain torch; zero without any."""
+    if len(children.means) == 0:
+        none = children.means.sum()
+        return Penalties(none, none, none)
     return Penalties(
         losses.covariance_loss(children.factors, voxel=1.0),
         losses.separation_loss(children.offsets),

@@ -36,8 +36,7 @@ Composition = Literal["over", "together"]
 _LOOK_EVERY = 100
 # Iterations in which the learning rates fall, as a share of those before.
 _FALL = 0.5
-# When transparent carriers are left out, as shares of the iterations: before the rates have fallen, as what is fitted
-# beside them has to make up for them.
+# When transparent carriers are left out, as shares of the iterations: not in the last fifth, which makes up for them.
 _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
 
 
@@ -206,8 +205,7 @@ def fit_appearance(
             fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
         if settings.prune_opacity > 0 and iteration in prunings:
-            looks = Appearance(features.all(), appearance.log_scales, decoder)
-            carriers.drop(torch.from_numpy(~visible_carriers(looks, settings.prune_opacity)))
+            carriers.drop(decoder.mean_opacity(features.all()).detach() < settings.prune_opacity)
             features.keep(carriers.ids)
         target = targets[queue.pop()]
         active = carriers.of(target)

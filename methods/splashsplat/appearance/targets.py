@@ -27,6 +27,8 @@ from ..kernel.window_loss import WindowPhotograph
 SilhouetteNorm = Literal["image", "window", "mask"]
 
 MASK_MARGIN = 8
+# `TrainingTarget.hidden` of carriers that the container hides as a whole.
+HIDDEN = 255
 # A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
 SAME_TIME = 0.01
 
@@ -54,11 +56,6 @@ class TrainingTarget:
     hidden: Tensor | None = None
     frozen: Frozen | None = None
     modes: np.ndarray | None = None
-
-    @property
-    def visibility(self) -> Tensor | None:
-        """1 for the carriers that the view can see, 0 for those that the container hides, float32 [n], or None."""
-        return None if self.hidden is None else 1 - self.hidden.to(torch.float32) / 255
 
 
 def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
@@ -91,7 +88,7 @@ def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) 
 
 def _in_bytes(shares: np.ndarray) -> Tensor:
     """Shares in [0, 1] as uint8: there is one for every carrier of every photograph."""
-    return torch.from_numpy(np.rint(255 * shares).astype(np.uint8))
+    return torch.from_numpy(np.rint(HIDDEN * shares).astype(np.uint8))
 
 
 def _modes(camera: Camera, box: tuple[int, int, int, int]) -> np.ndarray:

@@ -7,7 +7,7 @@ import torch
 from splashbench.observe.grid import Grid
 from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance.active import ActiveCarriers
-from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings
+from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, ScaleResidual
 from splashbench_methods.splashsplat.appearance.fitting import FitSettings, fit_appearance, initial_appearance
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.carriers.population import Carriers
@@ -112,3 +112,18 @@ def test_a_transparent_carrier_is_not_fitted_any_further() -> None:
     assert kept[1] > 10
     assert 0 < dropped[1] < 2.5  # the two before the first look
     assert min(dropped[0], dropped[2]) > 5
+
+
+@pytest.mark.parametrize("residual", ["bounded", "linear"])
+@pytest.mark.parametrize(("prune_opacity", "hidden"), [(0.9, None), (0.0, [255, 255, 255])])
+def test_photographs_that_teach_no_carrier_do_no_harm(
+    prune_opacity: float, hidden: list[int] | None, residual: ScaleResidual
+) -> None:
+    settings = FitSettings(iterations=10, feature_cells=(4.0,), prune_opacity=prune_opacity)
+    heads = DecoderSettings(feature_size=4, children=1, scale_residual=residual)
+    appearance = initial_appearance(4, 1.0, settings, heads, seed=0)
+    targets = [_target(0, hidden=hidden), _target(1, hidden=hidden)]
+    losses = fit_appearance(appearance, _track(), targets, settings, 100.0, 0, lambda done: None)
+    assert len(losses) == 10
+    assert np.isfinite(losses).all()
+    assert bool(torch.isfinite(appearance.features).all())
