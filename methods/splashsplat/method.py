@@ -57,17 +57,28 @@ class FittedSplashSplat(Fitted):
             self._frozen = camera, freeze(*self.background.gaussians(camera), camera)
         return self._frozen[1]
 
-    @torch.no_grad()
     def children(self, camera: Camera, time: float) -> Children | None:
-        """The Gaussians of the liquid as `camera` sees them at `time` (seconds); None where there is no liquid."""
-        shown = [
-            self._decoded(camera, ids, state)
+        """The Gaussians of the liquid as `camera` sees them at `time` (seconds); None where there is no liquid.
+
+        Those that the container's near wall cuts are whole here.
+        """
+        shown = self._shown(camera, time)
+        return None if shown is None else shown[0]
+
+    @torch.no_grad()
+    def _shown(self, camera: Camera, time: float) -> tuple[Children, torch.Tensor | None] | None:
+        """`children`, and which of their carriers lie before the near wall (bool [n]); None where none is to be cut."""
+        parts = [
+            (self._decoded(camera, ids, state), state.positions.numpy().astype(np.float64))
             for ids, state in carriers_at(self.liquid.track, self.liquid.times, time, self.liquid.between_frames)
             if len(ids)
         ]
-        if len(shown) < 2:
-            return shown[0] if shown else None
-        return Children(*(torch.cat([getattr(children, f.name) for children in shown]) for f in fields(Children)))
+        if not parts:
+            return None
+        shown, places = zip(*parts)
+        children = Children(*(torch.cat([getattr(part, f.name) for part in shown]) for f in fields(Children)))
+        wall = None if self.occlusion is None else self.occlusion.wall(camera)
+        return children, None if wall is None else torch.from_numpy(wall.in_front(np.concatenate(places)))
 
     def _decoded(self, camera: Camera, ids: torch.Tensor, state: CarrierState) -> Children:
         if self.occlusion is not None:
@@ -82,16 +93,20 @@ class FittedSplashSplat(Fitted):
     @torch.no_grad()
     def render(self, camera: Camera, time: float) -> Render:
         """The view of `camera` at `time` (seconds), any time; between frames see carriers/between.py."""
-        children = self.children(camera, time)
-        if children is None:
+        shown = self._shown(camera, time)
+        if shown is None:
             background = self._background(camera)
             return Render(background.copy(), np.zeros(background.shape[:2], dtype=np.float32))
+        children, in_front = shown
         with one_torch_thread():
             if self.liquid.composition == "together":
                 far = torch.from_numpy(self.background.far_color)
                 rgb, alpha = composite(children, camera, far, self._frozen_background(camera))
             else:
-                rgb, alpha = composite(children, camera, torch.from_numpy(self._background(camera)))
+                wall = None if self.occlusion is None else self.occlusion.wall(camera)
+                cut = None if wall is None else torch.from_numpy(wall.share)
+                behind = torch.from_numpy(self._background(camera))
+                rgb, alpha = composite(children, camera, behind, wall=cut, in_front=in_front)
             return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
 
     def particles(self) -> Particles:

@@ -64,11 +64,15 @@ def fit_liquid(
     observations = observe(scene, config.fields, run, report_tracking)
     carriers, motion, packed = _track(observations, scene, config, run, report_tracking)
     carriers = store_precision(carriers, observations.grid)
+    occlusion = observations.occlusion
+    if occlusion is not None and frozen is not None:
+        occlusion = occlusion.uncut()  # the background's Gaussians hide what is behind them themselves
     with run.stage("appearance"), one_torch_thread():
         track = Track(observations.grid, carriers, motion, packed)
         appearance = _fit_appearance(
             track,
             observations,
+            occlusion,
             scene,
             backgrounds,
             frozen,
@@ -91,7 +95,7 @@ def fit_liquid(
         composition,
         config.between_frames,
     )
-    return liquid, observations.occlusion
+    return liquid, occlusion
 
 
 def _track(
@@ -175,6 +179,7 @@ def _simulation(
 def _fit_appearance(
     track: Track,
     observations: Observations,
+    occlusion: LiquidOcclusion | None,
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],
     frozen: Mapping[str, Frozen] | None,
@@ -183,7 +188,7 @@ def _fit_appearance(
     progress: Callable[[float], None],
 ) -> Appearance:
     """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail."""
-    occlusion, voxel = observations.occlusion, observations.grid.voxel
+    voxel = observations.grid.voxel
     appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
     targets = collect_targets(
         scene,
@@ -193,6 +198,7 @@ def _fit_appearance(
         camera_times=config.camera_times,
         trusted=~observations.silhouettes.failed_masks,
         hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
+        wall=None if occlusion is None else lambda name: occlusion.wall(scene.cameras[name]),
         frozen=frozen,
     )
     if targets:

@@ -65,6 +65,15 @@ class TestPlate:
         np.testing.assert_allclose(plate.image[plate.seen], small[plate.seen], atol=5)
         assert (plate.image[~plate.seen] == 0).all()
 
+    def test_beside_liquid_that_never_moves_a_plate_comes_nearer(self, passing_liquid):
+        scene, background = passing_liquid
+        seen = make_clean_plate(scene, "1", longest_side=1000).seen
+        # The margin is of two pixels, and of one at the square that stays; nothing is taken from the first frame alone.
+        assert not seen[28:33, 38:43].any()
+        assert not seen[27, 40]
+        assert seen[26, 40]
+        assert not make_clean_plate(scene, "1", longest_side=1000, n_frames=1).seen[26, 40]
+
     def test_one_frame_is_the_first_and_later_ones_are_not_even_read(self, passing_liquid):
         scene, background = passing_liquid
         read: list[int] = []

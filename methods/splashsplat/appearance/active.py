@@ -20,12 +20,14 @@ from .targets import HIDDEN, TrainingTarget
 @dataclass(frozen=True)
 class Active:
     """n carriers that a photograph teaches. ids: int64 [n], their rows in the tables. places: int64 [n] among the
-    frame's own that are left, or None for all of these. state: of the instant. cells: for the colour penalty."""
+    frame's own that are left, or None for all of these. state: of the instant. cells: for the colour penalty. in_front:
+    bool [n], those that lie before the container's near wall; None for none."""
 
     ids: Tensor
     places: Tensor | None
     state: CarrierState
     cells: ColorCells
+    in_front: Tensor | None = None
 
 
 class ActiveCarriers:
@@ -60,7 +62,8 @@ class ActiveCarriers:
         numbers = chosen(self._cells[t], places)
         # Cells of which none is left count one, as nothing may be divided by zero.
         sizes = torch.bincount(numbers).clamp_min(1).to(torch.float32)
-        return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes))
+        in_front = None if target.in_front is None else chosen(chosen(target.in_front, left), places)
+        return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes), in_front)
 
     def drop(self, transparent: Tensor) -> None:
         """Leave out the carriers `transparent` (bool [count]) from now on."""

@@ -93,23 +93,55 @@ def composite(
     background: Tensor,
     frozen: Frozen | None = None,
     modes: np.ndarray | None = None,
+    wall: Tensor | None = None,
+    in_front: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Liquid and background: rgb [h, w, 3], and the opacity [h, w] of the liquid alone.
 
     background: [h, w, 3] or [3], behind everything. frozen: the background's Gaussians for this camera, which are drawn
     in one order of depth with the liquid's (Eq. rendering); without them the liquid lies in front. modes: the tiles
-    in which colours are needed, for the former. The opacity is "obtained by rasterizing G^fg alone" (supplement).
+    in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall, which
+    the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same. Not both
+    frozen and wall. The opacity is "obtained by rasterizing G^fg alone" (supplement).
     """
     shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
     colors = children.colors.flatten(0, 1)
     image: Tensor
     alpha: Tensor
-    if frozen is None:
+    if frozen is None and wall is not None:
+        image, alpha = _behind_wall(shapes, colors, camera, background, wall, in_front)
+    elif frozen is None:
         image, alpha = rasterize(*shapes, colors, camera, background=background)
     else:
         image, _ = rasterize(*shapes, colors, camera, background=background, frozen=frozen, modes=modes)
         _, alpha = rasterize(*shapes, None, camera)
     return image, alpha
+
+
+def _behind_wall(
+    shapes: tuple[Tensor, Tensor, Tensor],
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor,
+    wall: Tensor,
+    in_front: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """`composite` where a wall cuts the liquid, except for the carriers `in_front` of it."""
+    before = None
+    if in_front is not None and bool(in_front.any()):
+        # Children of one carrier follow each other.
+        drawn = in_front.repeat_interleave(len(colors) // len(in_front))
+        before, behind = drawn.nonzero()[:, 0], (~drawn).nonzero()[:, 0]
+        last = (part.index_select(0, before) for part in (*shapes, colors))
+        first, second, third = (part.index_select(0, behind) for part in shapes)
+        shapes, colors = (first, second, third), colors.index_select(0, behind)
+    image, alpha = rasterize(*shapes, colors, camera, background=background)
+    image = image + wall[..., None] * (background - image)
+    alpha = alpha * (1 - wall)
+    if before is None:
+        return image, alpha
+    over, opacity = rasterize(*last, camera)
+    return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
 
 
 def image_loss(
@@ -175,7 +207,9 @@ def fit_appearance(
     ) -> tuple[Tensor, Tensor, Penalties | None]:
         cells = active.cells if penalised else None
         children, penalty_terms = decoder.decode(values[0], values[1], None, active.state, target.eye, cells)
-        images = composite(children, target.camera, target.background, target.frozen, target.modes)
+        images = composite(
+            children, target.camera, target.background, target.frozen, target.modes, target.wall, active.in_front
+        )
         return *images, penalty_terms
 
     def learned(t: int, active: Active) -> list[Tensor]:

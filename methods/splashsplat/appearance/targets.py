@@ -22,6 +22,7 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
+from ..fields.near_wall import NearWall
 from ..kernel.window_loss import WindowPhotograph
 
 SilhouetteNorm = Literal["image", "window", "mask"]
@@ -42,6 +43,8 @@ class TrainingTarget:
     kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all Gaussians. area: pixels over which the
     silhouette term averages. hidden: uint8 [n], by how many 255ths the container hides each carrier of the
     frame from the view, or None.
+    wall: float32 [h, w], share of each pixel in which the container's near wall lies before the liquid, or None; in_front:
+    bool [n], carriers of the frame that lie before the wall, or None for none.
     frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
     the losses read, see `splashbench.render.tile_modes`.
     """
@@ -56,6 +59,8 @@ class TrainingTarget:
     hidden: Tensor | None = None
     frozen: Frozen | None = None
     modes: np.ndarray | None = None
+    wall: Tensor | None = None
+    in_front: Tensor | None = None
 
 
 def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
@@ -106,14 +111,16 @@ def collect_targets(
     camera_times: bool = False,
     trusted: np.ndarray | None = None,
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
+    wall: Callable[[str], NearWall | None] | None = None,
     frozen: Mapping[str, Frozen] | None = None,
 ) -> list[TrainingTarget]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
     backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
     its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
-    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). frozen: of each view,
-    Gaussians of the background that are drawn together with the liquid's. silhouette_norm: the silhouette term
+    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). wall: given a view's name, what
+    cuts the liquid in its images. frozen: of each view, Gaussians of the background that are drawn together with the
+    liquid's. silhouette_norm: the silhouette term
     averages over the "image", as in the paper, whose images are crops about the liquid; or over the "window" around
     all masks of the view, such a crop of images that are none; or over the "mask".
     """
@@ -130,6 +137,8 @@ def collect_targets(
         whole = silhouette_norm == "image" or name in frozen
         eye = torch.tensor(camera.center, dtype=torch.float32)
         taken = scene.camera_times[name] if camera_times else scene.times
+        near = None if wall is None else wall(name)
+        share = None if near is None else torch.from_numpy(near.share)
         for t, mask in enumerate(masks):
             if not mask.any() or (trusted is not None and not trusted[t, view]):
                 continue
@@ -148,6 +157,7 @@ def collect_targets(
                 left=box[0] - x0,
             )
             background = torch.from_numpy(backgrounds[name])
+            in_front = None if near is None else near.in_front(positions)
             targets.append(
                 TrainingTarget(
                     frame=frame,
@@ -160,6 +170,8 @@ def collect_targets(
                     hidden=None if hidden is None else _in_bytes(hidden(name, positions)),
                     frozen=frozen.get(name),
                     modes=_modes(camera, box) if name in frozen else None,
+                    wall=None if share is None else share[y0:y1, x0:x1],
+                    in_front=None if in_front is None or not in_front.any() else torch.from_numpy(in_front),
                 )
             )
     return targets

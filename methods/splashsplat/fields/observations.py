@@ -8,7 +8,7 @@ The runs of one study share both (`Run.reuse`): they are most of a short fit, an
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,12 @@ from splashbench.scene.scene import TrainingScene
 from .container import known_container
 from .gravity_cues import GravityCues, gravity_cues
 from .occlusion import LiquidOcclusion
+from .rim import rim_of
 
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 5
+_REVISION = 6
 
 
 @dataclass(frozen=True)
@@ -138,11 +139,18 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
             if scene.gravity is not None
             else f"along the container's axis, {np.round(gravity, 4).tolist()}",
         )
+    rim = None
+    if container is not None and container.hides:
+        report(0.0, "looking where the container's rim ends the liquid")
+        with run.stage("rim"):
+            rim = rim_of(known, scene, silhouettes.failed_masks)
+        run.note("rim", str(rim))
+        container = replace(container, mesh=rim.mesh)
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
     hull_grid, grid = Grid.over(bounds, settings.hull_cells), Grid.over(bounds, settings.transport_cells)
     occlusion = None
-    if container is not None and container.hides:
-        occlusion = LiquidOcclusion(container.mesh, hull_grid.voxel)
+    if rim is not None:
+        occlusion = rim.occlusion(hull_grid.voxel)
     depths = [None if occlusion is None else occlusion.depth(camera) for camera in silhouettes.cameras]
     cues = None
     if gravity is not None and (settings.pool or settings.ballistic):

@@ -1,7 +1,8 @@
 """Which carriers the container hides from a camera: they are not drawn, and do not explain what a view shows.
 
-Decided per carrier and view, by the container's depth at the four pixels about the carrier's centre, so that a rim cuts
-through pixels. `splashbench.observe.occlusion` is the same for carving. The paper composites by the depth of Gaussians
+Carriers behind the container are left out, decided by its depth at the four pixels about a carrier's centre. Where the
+container is a vessel whose edges are where the masks end, its near wall cuts what is behind it pixel by pixel
+(near_wall.py). `splashbench.observe.occlusion` is the same for carving. The paper composites by the depth of Gaussians
 alone.
 """
 
@@ -17,38 +18,72 @@ from splashbench.observe.container import depth_image, hidden_share
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
+from .near_wall import NearWall, near_wall
+
 _FILE = "container.npz"
-# Depth images in memory; the oldest goes.
-_MAX_DEPTH_IMAGES = 24
+# Cameras whose images are in memory; the oldest goes.
+_MAX_CAMERAS = 24
 
 
 class LiquidOcclusion:
     """An opaque container between cameras and liquid.
 
-    mesh: in scene units. tolerance: points this much behind its surface are seen still, scene units.
+    mesh: in scene units. tolerance: points this much behind its surface are seen still, scene units. room: bool [F, 2]
+    of `room_beside`, and up: unit vector [3], where the near wall cuts pixels; None where carriers are left out alone.
     """
 
-    def __init__(self, mesh: ContainerMesh, tolerance: float) -> None:
+    def __init__(
+        self,
+        mesh: ContainerMesh,
+        tolerance: float,
+        room: np.ndarray | None = None,
+        up: np.ndarray | None = None,
+    ) -> None:
         self.mesh, self.tolerance = mesh, tolerance
+        self.room, self.up = room, up
         self._depths: dict[int, tuple[Camera, np.ndarray]] = {}
+        self._walls: dict[int, tuple[Camera, NearWall | None]] = {}
+
+    def uncut(self) -> LiquidOcclusion:
+        """The same container, which leaves carriers out and cuts no pixels."""
+        return LiquidOcclusion(self.mesh, self.tolerance)
 
     def depth(self, camera: Camera) -> np.ndarray:
         """Depth of the container in `camera`'s image, float32 [H, W], inf where there is none."""
         # By identity, as arrays make no key; the camera is kept so that its number is not given to another.
         if id(camera) not in self._depths:
-            if len(self._depths) >= _MAX_DEPTH_IMAGES:
+            if len(self._depths) >= _MAX_CAMERAS:
                 self._depths.pop(next(iter(self._depths)))
             self._depths[id(camera)] = camera, depth_image(self.mesh, camera)
         return self._depths[id(camera)][1]
 
+    def wall(self, camera: Camera) -> NearWall | None:
+        """What cuts the liquid in `camera`'s image; None where nothing does."""
+        if self.room is None or self.up is None:
+            return None
+        if id(camera) not in self._walls:
+            if len(self._walls) >= _MAX_CAMERAS:
+                self._walls.pop(next(iter(self._walls)))
+            self._walls[id(camera)] = camera, near_wall(self.mesh, self.room, self.up, camera, self.tolerance)
+        return self._walls[id(camera)][1]
+
     def hidden(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """float32 [n] in [0, 1]: how far `points` [n, 3] (scene units) lie behind the container for `camera`."""
+        """float32 [n] in [0, 1]: how far `points` [n, 3] (scene units) lie behind the container for `camera`. What its
+        near wall is to cut does not count as hidden."""
+        wall = self.wall(camera)
+        if wall is not None:
+            return wall.hidden(points, self.tolerance)
         return hidden_share(points, self.depth(camera), camera, self.tolerance)
 
     def save(self, directory: Path) -> None:
         """Write container.npz into `directory`."""
+        cut = {} if self.room is None or self.up is None else {"room": self.room, "up": self.up}
         np.savez_compressed(
-            directory / _FILE, vertices=self.mesh.vertices, faces=self.mesh.faces, tolerance=np.array([self.tolerance])
+            directory / _FILE,
+            vertices=self.mesh.vertices,
+            faces=self.mesh.faces,
+            tolerance=np.array([self.tolerance]),
+            **cut,
         )
 
     @classmethod
@@ -57,8 +92,14 @@ class LiquidOcclusion:
         path = directory / _FILE
         if not path.is_file():
             return None
-        arrays = read_npz(path, {"vertices": 2, "faces": 2, "tolerance": 1})
+        arrays = read_npz(path, {"vertices": 2, "faces": 2, "tolerance": 1}, {"room": 2, "up": 1})
         try:
-            return cls(ContainerMesh(arrays["vertices"], arrays["faces"]), float(arrays["tolerance"][0]))
+            mesh = ContainerMesh(arrays["vertices"], arrays["faces"])
+            room, up = arrays.get("room"), arrays.get("up")
+            if room is not None and up is not None:
+                if room.shape != (len(mesh.faces), 2) or up.shape != (3,):
+                    raise ValueError("its arrays do not fit together")
+                room = room.astype(bool)
+            return cls(mesh, float(arrays["tolerance"][0]), room, up)
         except (ValueError, IndexError) as error:
             raise SplashbenchError(f"{path} is not a container ({error}); fit the scene again") from None
