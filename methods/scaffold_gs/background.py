@@ -108,7 +108,7 @@ def fit_background(
     plates: list[CleanPlate] = []
     for i, name in enumerate(scene.train):
         progress(0.05 * i / len(scene.train), "liquid-free plates")
-        plate = make_clean_plate(scene, name, settings.longest_side, n_frames)
+        plate = make_clean_plate(scene, name, settings.longest_side, n_frames, near_still=True)
         # A view that is liquid throughout says nothing, and has no loss.
         if plate.seen.any():
             plates.append(plate)

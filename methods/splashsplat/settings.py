@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "7"
+VERSION = "8"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -49,6 +49,8 @@ class SplashSplatConfig(MethodConfig):
     container: bool = True
     #: without a mesh: the upright vessel that fills the container masks, where the scene has them
     container_masks: bool = True
+    #: liquid is cut by pixels where the near wall of an opaque container hides it (needs gravity or container masks)
+    cut_at_rim: bool = True
     #: look for masks that miss much of the liquid, and replace them
     detect_failed_masks: bool = True
     #: replace empty masks where other views see liquid; in the paper they say that there is none
@@ -116,6 +118,8 @@ class SplashSplatConfig(MethodConfig):
     learning_rate_scales: PositiveFloat = 1e-2
     #: carriers born in one cell share a part of their features: its size in voxels and in frames, for each part
     feature_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
+    #: and one with all carriers ever born in a cell of so many voxels; 0 for none
+    still_cell: float = Field(2.0, ge=0)
     anneal: bool = True
     #: share of the photographs by whose loss the fit stops before `iterations`, and which it leaves out; 0 never stops
     validation_share: float = Field(0.0, ge=0, le=0.1)
@@ -158,6 +162,7 @@ class SplashSplatConfig(MethodConfig):
             "signed_distance": "carve",
             "container": False,
             "container_masks": False,
+            "cut_at_rim": False,
             "detect_failed_masks": False,
             "replace_empty_masks": False,
             "camera_times": False,
@@ -188,6 +193,7 @@ class SplashSplatConfig(MethodConfig):
             "learning_rate_heads": 2e-3,
             "learning_rate_scales": 2e-3,
             "feature_cells": (),
+            "still_cell": 0.0,
             "anneal": False,
             "silhouette_norm": "image",
             "composition": "together",
@@ -230,6 +236,7 @@ class SplashSplatConfig(MethodConfig):
             signed_distance=self.signed_distance,
             container=self.container,
             container_masks=self.container_masks,
+            cut_at_rim=self.cut_at_rim,
             detect_failed_masks=self.detect_failed_masks,
             replace_empty_masks=self.replace_empty_masks,
             camera_times=self.camera_times,
@@ -294,6 +301,7 @@ class SplashSplatConfig(MethodConfig):
             learning_rate_features=self.learning_rate_features,
             learning_rate_cells=self.learning_rate_cells,
             feature_cells=self.feature_cells,
+            still_cell=self.still_cell,
             learning_rate_heads=self.learning_rate_heads,
             learning_rate_scales=self.learning_rate_scales,
             anneal=self.anneal,

@@ -43,19 +43,19 @@ class CleanPlate:
         return np.asarray(self.image * np.float32(1 / 255))
 
 
-def make_clean_plate(scene: TrainingScene, name: str, longest_side: int, n_frames: int = MAX_FRAMES) -> CleanPlate:
+def make_clean_plate(
+    scene: TrainingScene, name: str, longest_side: int, n_frames: int = MAX_FRAMES, near_still: bool = False
+) -> CleanPlate:
     """The plate of training camera `name`, shrunk so that no side exceeds `longest_side`.
 
     n_frames: it is the median over at most so many frames, evenly spread over the recording; with 1, frame 0 alone.
-    Pixels beside liquid are left out, as outlines are a few pixels off. Those that liquid is beside in every frame, as
-    a rim is beside a pool, are taken from half as near.
+    Pixels beside liquid are left out, as outlines are a few pixels off. near_still: those that liquid is beside in
+    every frame, as a rim is beside a pool, are taken from half as near.
     """
     camera = scene.cameras[name]
     frames = np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, n_frames)).round().astype(int))
     radius = max(2, round(_MARGIN * max(camera.width, camera.height)))
-    discs = [
-        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1)) for r in (radius, radius // 2)
-    ]
+    discs = [cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1)) for r in (radius, radius // 2)]
     small = _shrunk_camera(camera, longest_side)
     images = np.empty((len(frames), small.height, small.width, 3), np.uint8)
     dry, nearly = (np.empty(images.shape[:3], bool) for _ in discs)
@@ -65,7 +65,7 @@ def make_clean_plate(scene: TrainingScene, name: str, longest_side: int, n_frame
         far, near = (shrunk(CleanPlate(camera, image, cv2.dilate(mask, disc) == 0), longest_side) for disc in discs)
         images[i] = np.where(far.seen[..., None], far.image, near.image)
         dry[i], nearly[i] = far.seen, near.seen
-    if len(frames) > 1:  # one frame says nothing of what liquid is always beside
+    if near_still and len(frames) > 1:  # one frame says nothing of what liquid is always beside
         dry |= nearly & ~dry.any(axis=0)
     return CleanPlate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)))
 

@@ -66,13 +66,14 @@ class TestPlate:
         assert (plate.image[~plate.seen] == 0).all()
 
     def test_beside_liquid_that_never_moves_a_plate_comes_nearer(self, passing_liquid):
-        scene, background = passing_liquid
-        seen = make_clean_plate(scene, "1", longest_side=1000).seen
+        scene, _ = passing_liquid
+        seen = make_clean_plate(scene, "1", longest_side=1000, near_still=True).seen
         # The margin is of two pixels, and of one at the square that stays; nothing is taken from the first frame alone.
         assert not seen[28:33, 38:43].any()
         assert not seen[27, 40]
         assert seen[26, 40]
-        assert not make_clean_plate(scene, "1", longest_side=1000, n_frames=1).seen[26, 40]
+        assert not make_clean_plate(scene, "1", longest_side=1000).seen[26, 40]
+        assert not make_clean_plate(scene, "1", longest_side=1000, n_frames=1, near_still=True).seen[26, 40]
 
     def test_one_frame_is_the_first_and_later_ones_are_not_even_read(self, passing_liquid):
         scene, background = passing_liquid

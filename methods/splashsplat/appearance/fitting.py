@@ -48,8 +48,8 @@ class FitSettings:
     anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. validation_share: of the
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
     `AdaptiveSchedule`. prune_opacity: carriers whose learned opacity is below this at one of `_PRUNINGS` are not
-    fitted any further; 0 fits all to the end. feature_cells: see `SharedFeatures`; learning_rate_cells is that of the
-    shared parts.
+    fitted any further; 0 fits all to the end. feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is
+    that of the shared parts.
     """
 
     iterations: int = 1000
@@ -58,6 +58,7 @@ class FitSettings:
     learning_rate_features: float = 0.06
     learning_rate_cells: float = 0.02
     feature_cells: tuple[float, ...] = ()
+    still_cell: float = 0.0
     learning_rate_heads: float = 0.015
     learning_rate_scales: float = 1e-2
     anneal: bool = True
@@ -100,9 +101,9 @@ def composite(
 
     background: [h, w, 3] or [3], behind everything. frozen: the background's Gaussians for this camera, which are drawn
     in one order of depth with the liquid's (Eq. rendering); without them the liquid lies in front. modes: the tiles
-    in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall, which
-    the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same. Not both
-    frozen and wall. The opacity is "obtained by rasterizing G^fg alone" (supplement).
+    in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall,
+    which the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same.
+    Not both frozen and wall. The opacity is "obtained by rasterizing G^fg alone" (supplement).
     """
     shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
     colors = children.colors.flatten(0, 1)
@@ -127,20 +128,23 @@ def _behind_wall(
     in_front: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """`composite` where a wall cuts the liquid, except for the carriers `in_front` of it."""
-    before = None
-    if in_front is not None and bool(in_front.any()):
-        # Children of one carrier follow each other.
-        drawn = in_front.repeat_interleave(len(colors) // len(in_front))
-        before, behind = drawn.nonzero()[:, 0], (~drawn).nonzero()[:, 0]
-        last = (part.index_select(0, before) for part in (*shapes, colors))
-        first, second, third = (part.index_select(0, behind) for part in shapes)
-        shapes, colors = (first, second, third), colors.index_select(0, behind)
-    image, alpha = rasterize(*shapes, colors, camera, background=background)
-    image = image + wall[..., None] * (background - image)
-    alpha = alpha * (1 - wall)
-    if before is None:
-        return image, alpha
-    over, opacity = rasterize(*last, camera)
+    if in_front is None or not bool(in_front.any()):
+        image, alpha = rasterize(*shapes, colors, camera, background=background)
+        return image + wall[..., None] * (background - image), alpha * (1 - wall)
+    # Children of one carrier follow each other.
+    drawn_last = in_front.repeat_interleave(len(colors) // len(in_front))
+
+    def part(chosen: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:
+        rows = chosen.nonzero()[:, 0]
+        means, factors, opacities = (values.index_select(0, rows) for values in shapes)
+        drawn: tuple[Tensor, Tensor] = rasterize(
+            means, factors, opacities, colors.index_select(0, rows), camera, background=behind
+        )
+        return drawn
+
+    image, alpha = part(~drawn_last, background)
+    image, alpha = image + wall[..., None] * (background - image), alpha * (1 - wall)
+    over, opacity = part(drawn_last, None)
     return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
 
 
@@ -188,6 +192,7 @@ def fit_appearance(
         track.carriers,
         carriers.ids,
         settings.feature_cells,
+        settings.still_cell,
         settings.learning_rate_features,
         settings.learning_rate_cells,
         seed,

@@ -2,8 +2,9 @@
 
 A carrier lasts a few frames, and a handful of photographs show it. Alone, it would learn its looks from these only. So
 its feature is a sum: its own part, and one for each size of cell. It shares that one with every carrier that was born
-in the same cell of space and time. A photograph then teaches neighbours, too. At the end the sum replaces the parts:
-decoder and files know nothing of them. Not in the paper.
+in the same cell of space and time. A photograph then teaches neighbours, too. Where liquid is still, as in a pool,
+cells that last for the whole sequence let every photograph of a place teach all carriers there. At the end the sum
+replaces the parts: decoder and files know nothing of them. Not in the paper.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class SharedFeatures:
 
     own: float32 [count, width], the carriers' own parts at first; updated in place. ids: int64 [n] of each frame, its
     carriers' rows there. sizes: of the cells, in transport voxels and, by the same number, in frames; none where
-    nothing is shared. own_rate, shared_rate: of learning.
+    nothing is shared. still_size: of cells that last for all frames, in transport voxels; 0 for none. own_rate,
+    shared_rate: of learning.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class SharedFeatures:
         carriers: Carriers,
         ids: list[Tensor],
         sizes: Sequence[float],
+        still_size: float,
         own_rate: float,
         shared_rate: float,
         seed: int,
@@ -53,13 +56,16 @@ class SharedFeatures:
         self._own, self._adam = own, RowAdam(own, own_rate)
         self._ids = ids
         self._levels: list[_FeatureLevel] = []
-        if not sizes:
+        extents = [(size, size) for size in sizes]
+        if still_size > 0:
+            extents.append((still_size, np.inf))
+        if not extents:
             return
         born = births(carriers)
         # Cells of different sizes have their faces at different places.
         rng = np.random.default_rng([seed, 4])
-        for size in sizes:
-            cells = torch.from_numpy(cells_of(born, size, rng.random(4)))
+        for size, frames in extents:
+            cells = torch.from_numpy(cells_of(born, size, frames, rng.random(4)))
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
             self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), *_by_frame(cells, ids)))
 
@@ -113,11 +119,12 @@ def births(carriers: Carriers) -> np.ndarray:
     return born
 
 
-def cells_of(born: np.ndarray, size: float, shift: np.ndarray) -> np.ndarray:
+def cells_of(born: np.ndarray, size: float, frames: float, shift: np.ndarray) -> np.ndarray:
     """The cell of each of `born` [count, 4] (see `births`), int64 [count] numbered from 0 without gaps.
 
-    size: of a cell, in transport voxels and in frames. shift: [4] where its faces are along x, y, z and time, in cells.
+    size, frames: of a cell, in transport voxels and in frames, which may be infinite. shift: [4] where its faces are
+    along x, y, z and time, in cells.
     """
-    keys = np.floor(born / size + shift).astype(np.int64)
+    keys = np.floor(born / np.array([size, size, size, frames]) + shift).astype(np.int64)
     _, cells = np.unique(keys, axis=0, return_inverse=True)
     return cells.reshape(-1)

@@ -43,8 +43,8 @@ class TrainingTarget:
     kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all Gaussians. area: pixels over which the
     silhouette term averages. hidden: uint8 [n], by how many 255ths the container hides each carrier of the
     frame from the view, or None.
-    wall: float32 [h, w], share of each pixel in which the container's near wall lies before the liquid, or None; in_front:
-    bool [n], carriers of the frame that lie before the wall, or None for none.
+    wall: float32 [h, w], share of each pixel in which the container's near wall lies before the liquid, or None;
+    in_front: bool [n], carriers of the frame that lie before the wall, or None for none.
     frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
     the losses read, see `splashbench.render.tile_modes`.
     """
@@ -118,11 +118,11 @@ def collect_targets(
 
     backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
     its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
-    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). wall: given a view's name, what
-    cuts the liquid in its images. frozen: of each view, Gaussians of the background that are drawn together with the
-    liquid's. silhouette_norm: the silhouette term
-    averages over the "image", as in the paper, whose images are crops about the liquid; or over the "window" around
-    all masks of the view, such a crop of images that are none; or over the "mask".
+    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). wall: given a view's name,
+    what cuts the liquid in its images. frozen: of each view, Gaussians of the background that are drawn together with
+    the liquid's. silhouette_norm: the silhouette term averages over the "image", as in the paper, whose images are
+    crops about the liquid; or over the "window" around all masks of the view, such a crop of images that are none; or
+    over the "mask".
     """
     frozen = frozen or {}
     targets = []

@@ -45,6 +45,7 @@ class FieldSettings:
     signed_distance: SignedDistanceMethod
     container: bool
     container_masks: bool
+    cut_at_rim: bool
     detect_failed_masks: bool
     replace_empty_masks: bool
     camera_times: bool
@@ -140,7 +141,7 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
             else f"along the container's axis, {np.round(gravity, 4).tolist()}",
         )
     rim = None
-    if container is not None and container.hides:
+    if container is not None and container.hides and settings.cut_at_rim:
         report(0.0, "looking where the container's rim ends the liquid")
         with run.stage("rim"):
             rim = rim_of(known, scene, silhouettes.failed_masks)
@@ -151,6 +152,8 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
     occlusion = None
     if rim is not None:
         occlusion = rim.occlusion(hull_grid.voxel)
+    elif container is not None and container.hides:
+        occlusion = LiquidOcclusion(container.mesh, hull_grid.voxel)
     depths = [None if occlusion is None else occlusion.depth(camera) for camera in silhouettes.cameras]
     cues = None
     if gravity is not None and (settings.pool or settings.ballistic):

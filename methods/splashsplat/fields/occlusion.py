@@ -77,14 +77,14 @@ class LiquidOcclusion:
 
     def save(self, directory: Path) -> None:
         """Write container.npz into `directory`."""
-        cut = {} if self.room is None or self.up is None else {"room": self.room, "up": self.up}
-        np.savez_compressed(
-            directory / _FILE,
-            vertices=self.mesh.vertices,
-            faces=self.mesh.faces,
-            tolerance=np.array([self.tolerance]),
-            **cut,
-        )
+        arrays = {
+            "vertices": self.mesh.vertices,
+            "faces": self.mesh.faces,
+            "tolerance": np.array([self.tolerance]),
+        }
+        if self.room is not None and self.up is not None:
+            arrays |= {"room": self.room, "up": self.up}
+        np.savez_compressed(directory / _FILE, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, directory: Path) -> LiquidOcclusion | None:

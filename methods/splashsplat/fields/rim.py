@@ -1,9 +1,9 @@
-"""Where the near wall's edge really is: it is moved until the liquid ends there in the training masks. Not in the paper.
+"""Where the near wall's edge is: moved until the liquid ends there in the training masks. Not in the paper.
 
 A pool that reaches behind the near rim ends at its edge in the image, frame after frame. A mesh that is a millimetre
-too high ends it half a pixel early, and half a pixel shows. A vessel found by its masks is its outside, while its edge is
-that of a lip with thickness. So the container is moved along its axis, by a plane over its opening, as far as liquid that
-masks show and the wall's outline disagree.
+too high ends it half a pixel early, and half a pixel shows. A vessel found by its masks is its outside, while its edge
+is that of a lip with thickness. So the container is moved along its axis, by a plane over its opening, as far as liquid
+that masks show and the wall's outline disagree.
 """
 
 from __future__ import annotations

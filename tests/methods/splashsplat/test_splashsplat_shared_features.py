@@ -26,13 +26,15 @@ def _features(*sizes: float, seed: int = 0) -> tuple[SharedFeatures, torch.Tenso
     return _shared(own, _carriers(), sizes, seed), own
 
 
-def _shared(own: torch.Tensor, carriers: Carriers, sizes: tuple[float, ...], seed: int = 0) -> SharedFeatures:
+def _shared(
+    own: torch.Tensor, carriers: Carriers, sizes: tuple[float, ...], seed: int = 0, still: float = 0.0
+) -> SharedFeatures:
     ids = [torch.from_numpy(carriers.ids[carriers.rows(t)].astype(np.int64)) for t in range(carriers.n_frames)]
-    return SharedFeatures(own, carriers, ids, sizes, **RATES, seed=seed)
+    return SharedFeatures(own, carriers, ids, sizes, still, **RATES, seed=seed)
 
 
 def test_a_cell_is_of_space_and_time_and_of_the_birth_alone() -> None:
-    near, late = cells_of(births(_carriers()), 4.0, np.zeros(4)), cells_of(births(_carriers()), 2.0, np.zeros(4))
+    near, late = (cells_of(births(_carriers()), size, size, np.zeros(4)) for size in (4.0, 2.0))
     # Carrier 1 moved eight voxels on, 2 ended where 0 began: neither matters.
     assert near[0] == near[1] == near[3]
     assert near[2] != near[0]
@@ -41,9 +43,19 @@ def test_a_cell_is_of_space_and_time_and_of_the_birth_alone() -> None:
 
 
 def test_faces_are_where_the_shift_says() -> None:
-    cells = cells_of(births(_carriers()), 4.0, np.array([0.6, 0.0, 0.0, 0.0]))  # faces at 1.6, 5.6, ... along x
+    cells = cells_of(births(_carriers()), 4.0, 4.0, np.array([0.6, 0.0, 0.0, 0.0]))  # faces at 1.6, 5.6, ... along x
     assert cells[0] != cells[1]
     assert cells[0] == cells[3]
+
+
+def test_still_cells_are_of_a_place_in_all_frames() -> None:
+    cells = cells_of(births(_carriers()), 2.0, np.inf, np.array([0.0, 0.0, 0.0, 0.9]))
+    assert cells[0] == cells[3]
+    assert len(set(cells)) == 3
+    features = _shared(torch.zeros(4, 2), _carriers(), (), still=1.5)
+    features.step(0, torch.ones(2, 2), factor=1.0)
+    assert bool((features.all()[3] < 0).all())  # born two frames later, where the first was
+    assert bool((features.all()[2] == 0).all())
 
 
 def test_a_step_moves_the_carriers_own_part_and_its_cells() -> None:
@@ -126,5 +138,10 @@ def test_settings_reach_the_fit() -> None:
         "best": (4.0, 16.0),
         "paper": (),
         "quick": (4.0, 16.0),
+    }
+    assert {name: config.optimisation.still_cell for name, config in presets.items()} == {
+        "best": 2.0,
+        "paper": 0.0,
+        "quick": 2.0,
     }
     assert SplashSplatConfig(learning_rate_cells=0.007).optimisation.learning_rate_cells == 0.007
