@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
+from scipy import ndimage
 
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
@@ -29,6 +30,9 @@ from splashbench.score.metrics import METRICS
 from splashbench.score.result import Digests, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1
 from splashbench.submission import Submission
+from splashbench_methods.splashsplat.fields.container import known_container
+from splashbench_methods.splashsplat.fields.near_wall import near_wall
+from splashbench_methods.splashsplat.fields.rim import rim_of
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
@@ -233,6 +237,43 @@ def vessels() -> list[Path]:
     return [store(figure, "method_vessel.png", 130)]
 
 
+def rims() -> list[Path]:
+    """A rim as it was found by the container masks, and where liquid masks end: over a training view that looks at a pool,
+    and the wall's share of its pixels."""
+    folder = WORK / "still_pool_small"
+    scene = Scene.open(made(folder, "synth", "scene", "still_pool", str(folder), "--size", "240x160"))
+    training = scene.training()
+    view, frame = scene.train[2], scene.n_frames // 2
+    vessel = known_container(training, mesh=False, from_masks=True)
+    moved = rim_of(vessel, training, np.zeros((scene.n_frames, len(scene.train)), dtype=bool))
+    assert moved.room is not None
+    assert moved.up is not None
+    assert vessel.occlusion is not None
+    walls = [
+        near_wall(mesh, moved.room, moved.up, scene.cameras[view], 0.0) for mesh in (vessel.occlusion.mesh, moved.mesh)
+    ]
+    mask = scene.mask(view, frame)
+    pieces, _ = ndimage.label(mask)
+    rows, columns = window(pieces == np.bincount(pieces[mask]).argmax(), 4)
+    rows = slice(rows.start + (rows.stop - rows.start) // 2, rows.stop)
+    extent = (columns.start - 0.5, columns.stop - 0.5, rows.stop - 0.5, rows.start - 0.5)
+    figure = Figure(figsize=(10, 2.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    bare(left, "the rim as found (orange), and moved to where masks end (blue)")
+    left.imshow(scene.image(view, frame)[rows, columns], extent=extent)
+    for wall, color in zip(walls, (ORANGE, BLUE)):
+        assert wall is not None
+        left.contour(wall.share, levels=[0.5], colors=[color], linewidths=1.5)
+    assert walls[1] is not None
+    bare(right, "what the wall takes of each pixel (white), and the liquid mask's outline")
+    right.imshow(walls[1].share[rows, columns], extent=extent, cmap="gray", vmin=0, vmax=1)
+    right.contour(mask, levels=[0.5], colors=[ORANGE], linewidths=1)
+    for axes in (left, right):
+        axes.set_xlim(*extent[:2])
+        axes.set_ylim(*extent[2:])
+    return [store(figure, "method_rim.png", 130)]
+
+
 def lives(active: NDArray[np.bool_], times: NDArray[np.float64]) -> Path:
     """How many carriers of each frame were born there, and how many came from an earlier frame."""
     born = active & ~np.roll(active, 1, axis=0)
@@ -290,6 +331,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "test_view": test_view,
     "method": method,
     "vessels": vessels,
+    "rims": rims,
     "tutorial": tutorial,
 }
 
