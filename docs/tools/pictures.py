@@ -238,8 +238,8 @@ def vessels() -> list[Path]:
 
 
 def rims() -> list[Path]:
-    """A rim as it was found by the container masks, and where liquid masks end: over a training view that looks at a pool,
-    and the wall's share of its pixels."""
+    """A rim as the container masks have it, and moved to where liquid masks end, over a view of a pool; and the
+    wall's share of its pixels."""
     folder = WORK / "still_pool_small"
     scene = Scene.open(made(folder, "synth", "scene", "still_pool", str(folder), "--size", "240x160"))
     training = scene.training()
