@@ -66,8 +66,8 @@ class FittedSplashSplat(Fitted):
         return None if shown is None else shown[0]
 
     @torch.no_grad()
-    def _shown(self, camera: Camera, time: float) -> tuple[Children, torch.Tensor | None] | None:
-        """`children`, and which of their carriers lie before the near wall (bool [n]); None where none is to be cut."""
+    def _shown(self, camera: Camera, time: float) -> tuple[Children, tuple[torch.Tensor, torch.Tensor] | None] | None:
+        """`children`, and what cuts them, see `LiquidOcclusion.cut`."""
         parts = [
             (self._decoded(camera, ids, state), state.positions.numpy().astype(np.float64))
             for ids, state in carriers_at(self.liquid.track, self.liquid.times, time, self.liquid.between_frames)
@@ -77,8 +77,8 @@ class FittedSplashSplat(Fitted):
             return None
         shown, places = zip(*parts)
         children = Children(*(torch.cat([getattr(part, f.name) for part in shown]) for f in fields(Children)))
-        wall = None if self.occlusion is None else self.occlusion.wall(camera)
-        return children, None if wall is None else torch.from_numpy(wall.in_front(np.concatenate(places)))
+        cut = None if self.occlusion is None else self.occlusion.cut(camera, np.concatenate(places))
+        return children, None if cut is None else (torch.from_numpy(cut[0]), torch.from_numpy(cut[1]))
 
     def _decoded(self, camera: Camera, ids: torch.Tensor, state: CarrierState) -> Children:
         if self.occlusion is not None:
@@ -97,16 +97,15 @@ class FittedSplashSplat(Fitted):
         if shown is None:
             background = self._background(camera)
             return Render(background.copy(), np.zeros(background.shape[:2], dtype=np.float32))
-        children, in_front = shown
+        children, cut = shown
         with one_torch_thread():
             if self.liquid.composition == "together":
                 far = torch.from_numpy(self.background.far_color)
                 rgb, alpha = composite(children, camera, far, self._frozen_background(camera))
             else:
-                wall = None if self.occlusion is None else self.occlusion.wall(camera)
-                cut = None if wall is None else torch.from_numpy(wall.share)
                 behind = torch.from_numpy(self._background(camera))
-                rgb, alpha = composite(children, camera, behind, wall=cut, in_front=in_front)
+                wall, in_front = cut or (None, None)
+                rgb, alpha = composite(children, camera, behind, wall=wall, in_front=in_front)
             return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
 
     def particles(self) -> Particles:

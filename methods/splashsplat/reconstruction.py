@@ -198,7 +198,7 @@ def _fit_appearance(
         camera_times=config.camera_times,
         trusted=~observations.silhouettes.failed_masks,
         hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
-        wall=None if occlusion is None else lambda name: occlusion.wall(scene.cameras[name]),
+        cut=None if occlusion is None else lambda name, points: occlusion.cut(scene.cameras[name], points),
         frozen=frozen,
     )
     if targets:

@@ -22,7 +22,6 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
-from ..fields.near_wall import NearWall
 from ..kernel.window_loss import WindowPhotograph
 
 SilhouetteNorm = Literal["image", "window", "mask"]
@@ -111,15 +110,16 @@ def collect_targets(
     camera_times: bool = False,
     trusted: np.ndarray | None = None,
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
-    wall: Callable[[str], NearWall | None] | None = None,
+    cut: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray] | None] | None = None,
     frozen: Mapping[str, Frozen] | None = None,
 ) -> list[TrainingTarget]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
     backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
     its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
-    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). wall: given a view's name,
-    what cuts the liquid in its images. frozen: of each view, Gaussians of the background that are drawn together with
+    and positions [n, 3], how far the container hides each of them (float [n] in [0, 1]). cut: given the same, the
+    share of each pixel in which a near wall lies before the liquid (float32 [H, W]), and which positions lie before it
+    (bool [n]); None for none. frozen: of each view, Gaussians of the background that are drawn together with
     the liquid's. silhouette_norm: the silhouette term averages over the "image", as in the paper, whose images are
     crops about the liquid; or over the "window" around all masks of the view, such a crop of images that are none; or
     over the "mask".
@@ -137,8 +137,6 @@ def collect_targets(
         whole = silhouette_norm == "image" or name in frozen
         eye = torch.tensor(camera.center, dtype=torch.float32)
         taken = scene.camera_times[name] if camera_times else scene.times
-        near = None if wall is None else wall(name)
-        share = None if near is None else torch.from_numpy(near.share)
         for t, mask in enumerate(masks):
             if not mask.any() or (trusted is not None and not trusted[t, view]):
                 continue
@@ -157,7 +155,7 @@ def collect_targets(
                 left=box[0] - x0,
             )
             background = torch.from_numpy(backgrounds[name])
-            in_front = None if near is None else near.in_front(positions)
+            share, in_front = (None if cut is None else cut(name, positions)) or (None, None)
             targets.append(
                 TrainingTarget(
                     frame=frame,
@@ -170,7 +168,7 @@ def collect_targets(
                     hidden=None if hidden is None else _in_bytes(hidden(name, positions)),
                     frozen=frozen.get(name),
                     modes=_modes(camera, box) if name in frozen else None,
-                    wall=None if share is None else share[y0:y1, x0:x1],
+                    wall=None if share is None else torch.from_numpy(share)[y0:y1, x0:x1],
                     in_front=None if in_front is None or not in_front.any() else torch.from_numpy(in_front),
                 )
             )

@@ -75,6 +75,12 @@ class LiquidOcclusion:
             return wall.hidden(points, self.tolerance)
         return hidden_share(points, self.depth(camera), camera, self.tolerance)
 
+    def cut(self, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Share of each pixel in which the near wall lies before the liquid (float32 [H, W]), and which of `points`
+        [n, 3] (scene units) lie before the wall (bool [n]); None where it cuts nothing."""
+        wall = self.wall(camera)
+        return None if wall is None else (wall.share, wall.in_front(points, self.tolerance))
+
     def save(self, directory: Path) -> None:
         """Write container.npz into `directory`."""
         arrays = {

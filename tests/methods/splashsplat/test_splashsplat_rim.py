@@ -117,8 +117,20 @@ def test_points_are_hidden_deep_behind_the_wall_alone() -> None:
     middle, deep, before = [0, LEVEL, 0], [0, 0.02, 0.055], [0, 0.08, 0.14]
     points = np.array([middle, deep, before, edge])
     assert wall.hidden(points, TOLERANCE).tolist() == [0, 1, 0, 0]
-    assert wall.in_front(points).tolist() == [False, False, True, False]
-    assert not wall.in_front(np.array([[0, 0, 5.0], [9, 0, 0]])).any()
+    assert wall.in_front(points, TOLERANCE).tolist() == [False, False, True, False]
+    assert not wall.in_front(np.array([[0, 0, 5.0], [9, 0, 0]]), TOLERANCE).any()
+
+
+def test_liquid_that_runs_down_the_outside_is_not_cut() -> None:
+    camera = camera_at("a", 0)
+    wall = wall_of(camera, bowl())
+    heights = np.linspace(0.02, 0.09, 15)
+    outside = np.stack([np.zeros(15), heights, 0.06 + 0.5 * heights], axis=1)
+    film = outside + np.array([0, 0, 0.001])
+    assert wall.in_front(film, TOLERANCE).all()
+    assert wall.hidden(film, TOLERANCE).max() < 0.5
+    within = outside - np.array([0, 0, 0.012])
+    assert not wall.in_front(within, TOLERANCE).any()
 
 
 @pytest.mark.parametrize("lift", [0.003, -0.004])
