@@ -54,16 +54,15 @@ class NearWall:
         return np.maximum(by_rest, (wholly > 0.999).astype(np.float32))
 
     def in_front(self, points: np.ndarray, tolerance: float) -> np.ndarray:
-        """bool [n]: `points` [n, 3] in front of the wall, as liquid that runs down its outside; beside the wall in the
-        image, in front of what of it is near. tolerance: see `LiquidOcclusion`."""
+        """bool [n]: `points` [n, 3] in front of the wall, as liquid that runs down its outside. Those beside the wall
+        in the image are not: what is nearer than a part of the wall may still be within. tolerance: see
+        `LiquidOcclusion`."""
         pixels, depth = self.camera.project(points)
-        nearest = cv2.erode(self.depth, self._disc, borderType=cv2.BORDER_REPLICATE)
-        nearest = np.where(np.isfinite(self.depth), self.depth + np.float32(tolerance), nearest)
         column, row = np.floor(np.nan_to_num(pixels)).astype(np.int64).T
         within = (depth > 0) & (column >= 0) & (column < self.camera.width) & (row >= 0) & (row < self.camera.height)
         found = np.zeros(len(points), dtype=bool)
-        limit = nearest[row[within], column[within]]
-        found[within] = np.isfinite(limit) & (depth[within] < limit)
+        limit = self.depth[row[within], column[within]]
+        found[within] = np.isfinite(limit) & (depth[within] < limit + tolerance)
         return found
 
     @property
