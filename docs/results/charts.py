@@ -276,7 +276,7 @@ def told_nothing() -> Figure:
         ("scaffold_4d", "D", BLUE, BLUE),
         ("splashsplat", "o", VERMILION, VERMILION),
     )
-    panels = (("psnr", "PSNR of the liquid, dB →"), ("lpips", "← LPIPS"), ("fit_seconds", "← fit, s"))
+    panels = (("psnr", "PSNR of the liquid, dB →"), ("lpips", "← LPIPS"), ("jitter_error", "← jitter error"))
     for place, (metric, title) in zip(places, panels):
         for name, marker, edge, face in marks:
             values = [figures[name, scene, metric] for scene in scenes]
