@@ -117,7 +117,7 @@ def fit_background(
         raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; fix the masks")
     far_color = np.median(np.concatenate([plate.image[plate.seen] for plate in plates]), axis=0) / 255
     progress(0.05, "depths of the background")
-    seed = _seed(points, plates, settings, run.seed)
+    seed = _seed(points, [plate.without_beside() for plate in plates], settings, run.seed)
     with one_torch_thread():
         model = fit_model(
             seed, plates, settings, far_color.astype(np.float32), run.seed,

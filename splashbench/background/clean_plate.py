@@ -32,11 +32,17 @@ class CleanPlate:
         camera: the view, of the plate's size.
         image: uint8 [H, W, 3], sRGB; black where `seen` is False.
         seen: bool [H, W], the pixel was free of liquid in at least one frame.
+        beside: bool [H, W], of these the pixels that liquid is beside in every frame; None for none.
     """
 
     camera: Camera
     image: NDArray[np.uint8]
     seen: NDArray[np.bool_]
+    beside: NDArray[np.bool_] | None = None
+
+    def without_beside(self) -> CleanPlate:
+        """The plate without the pixels that liquid is always beside: edges of liquid mislead a search for depth."""
+        return self if self.beside is None else CleanPlate(self.camera, self.image, self.seen & ~self.beside)
 
     def floats(self) -> NDArray[np.float32]:
         """The image as float32 [H, W, 3] in [0, 1]."""
@@ -65,9 +71,12 @@ def make_clean_plate(
         far, near = (shrunk(CleanPlate(camera, image, cv2.dilate(mask, disc) == 0), longest_side) for disc in discs)
         images[i] = np.where(far.seen[..., None], far.image, near.image)
         dry[i], nearly[i] = far.seen, near.seen
+    beside = None
     if near_still and len(frames) > 1:  # one frame says nothing of what liquid is always beside
-        dry |= nearly & ~dry.any(axis=0)
-    return CleanPlate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)))
+        nearly &= ~dry.any(axis=0)
+        dry |= nearly
+        beside = np.asarray(nearly.any(axis=0))
+    return CleanPlate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)), beside)
 
 
 def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -67,7 +67,11 @@ class TestPlate:
 
     def test_beside_liquid_that_never_moves_a_plate_comes_nearer(self, passing_liquid):
         scene, _ = passing_liquid
-        seen = make_clean_plate(scene, "1", longest_side=1000, near_still=True).seen
+        plate = make_clean_plate(scene, "1", longest_side=1000, near_still=True)
+        seen = plate.seen
+        strict = make_clean_plate(scene, "1", longest_side=1000)
+        np.testing.assert_array_equal(plate.without_beside().seen, strict.seen)
+        assert strict.without_beside() is strict
         # The margin is of two pixels, and of one at the square that stays; nothing is taken from the first frame alone.
         assert not seen[28:33, 38:43].any()
         assert not seen[27, 40]
