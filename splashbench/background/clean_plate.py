@@ -61,18 +61,21 @@ def make_clean_plate(
     camera = scene.cameras[name]
     frames = np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, n_frames)).round().astype(int))
     radius = max(2, round(_MARGIN * max(camera.width, camera.height)))
-    discs = [cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1)) for r in (radius, radius // 2)]
+    near_still = near_still and len(frames) > 1  # one frame says nothing of what liquid is always beside
+    margins = (radius, radius // 2) if near_still else (radius,)
+    discs = [cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1)) for r in margins]
     small = _shrunk_camera(camera, longest_side)
     images = np.empty((len(frames), small.height, small.width, 3), np.uint8)
-    dry, nearly = (np.empty(images.shape[:3], bool) for _ in discs)
+    dry, nearly = (np.zeros(images.shape[:3], bool) for _ in range(2))
     # Shrunk one by one: a 4K recording's frames do not fit into memory together.
     for i, t in enumerate(frames):
         image, mask = scene.image(name, t), scene.mask(name, t).astype(np.uint8)
-        far, near = (shrunk(CleanPlate(camera, image, cv2.dilate(mask, disc) == 0), longest_side) for disc in discs)
-        images[i] = np.where(far.seen[..., None], far.image, near.image)
-        dry[i], nearly[i] = far.seen, near.seen
+        plates = [shrunk(CleanPlate(camera, image, cv2.dilate(mask, disc) == 0), longest_side) for disc in discs]
+        images[i], dry[i] = plates[0].image, plates[0].seen
+        if near_still:
+            images[i][~dry[i]], nearly[i] = plates[1].image[~dry[i]], plates[1].seen
     beside = None
-    if near_still and len(frames) > 1:  # one frame says nothing of what liquid is always beside
+    if near_still:
         nearly &= ~dry.any(axis=0)
         dry |= nearly
         beside = np.asarray(nearly.any(axis=0))

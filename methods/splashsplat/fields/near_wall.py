@@ -9,6 +9,7 @@ that have no room for liquid in front of them: its outside, and the top of its r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -49,8 +50,7 @@ class NearWall:
         """float32 [n] in [0, 1]: how far `points` [n, 3] (scene units) are hidden; those near the wall's edge are not,
         as the wall will cut them. tolerance: see `LiquidOcclusion`."""
         by_rest = hidden_share(points, self.rest, self.camera, tolerance)
-        deep = cv2.dilate(np.where(np.isfinite(self.depth), self.depth, np.float32(1e30)), self._disc)
-        wholly = hidden_share(points, np.where(deep < 1e30, deep, np.float32(np.inf)), self.camera, tolerance)
+        wholly = hidden_share(points, self._deepest, self.camera, tolerance)
         return np.maximum(by_rest, (wholly > 0.999).astype(np.float32))
 
     def in_front(self, points: np.ndarray, tolerance: float) -> np.ndarray:
@@ -65,9 +65,10 @@ class NearWall:
         found[within] = np.isfinite(limit) & (depth[within] < limit + tolerance)
         return found
 
-    @property
-    def _disc(self) -> np.ndarray:
-        return np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8)
+    @cached_property
+    def _deepest(self) -> np.ndarray:
+        """float32 [H, W]: the wall's largest depth within reach of each pixel, inf where it ends there."""
+        return cv2.dilate(self.depth, np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8))
 
 
 def room_beside(mesh: ContainerMesh, vessel: Vessel) -> np.ndarray:

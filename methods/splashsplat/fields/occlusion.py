@@ -102,6 +102,8 @@ class LiquidOcclusion:
         try:
             mesh = ContainerMesh(arrays["vertices"], arrays["faces"])
             room, up = arrays.get("room"), arrays.get("up")
+            if (room is None) != (up is None):
+                raise ValueError("it has only one of room and up")
             if room is not None and up is not None:
                 if room.shape != (len(mesh.faces), 2) or up.shape != (3,):
                     raise ValueError("its arrays do not fit together")

@@ -23,7 +23,7 @@ from splashbench.scene.scene import TrainingScene
 from .container import KnownContainer
 from .near_wall import NearWall, near_wall, room_beside
 from .occlusion import LiquidOcclusion
-from .vessel import Vessel
+from .vessel import Vessel, upright
 
 # How far an edge is looked for, in pixels, and as a share of the image's longer side; and in what steps.
 _SEARCH, _SEARCH_SHARE, _STEP = 3.0, 0.008, 0.1
@@ -164,9 +164,7 @@ def moved(mesh: ContainerMesh, up: np.ndarray, fit: RimFit) -> ContainerMesh:
 
 def _opening(mesh: ContainerMesh, up: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     """Middle [3] and radius of the container, and two unit vectors [2, 3] across `up`."""
-    first = np.cross(np.eye(3)[int(np.argmin(np.abs(up)))], up)
-    first /= np.linalg.norm(first)
-    across = np.stack([first, np.cross(up, first)])
+    across = upright(-up)[:2]
     middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     radius = float(np.linalg.norm((mesh.vertices - middle) @ across.T, axis=1).max())
     return middle, max(radius, 1e-12), across
