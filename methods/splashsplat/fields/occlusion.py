@@ -108,6 +108,11 @@ class LiquidOcclusion:
                 if room.shape != (len(mesh.faces), 2) or up.shape != (3,):
                     raise ValueError("its arrays do not fit together")
                 room = room.astype(bool)
-            return cls(mesh, float(arrays["tolerance"][0]), room, up)
+                if abs(float(np.linalg.norm(up)) - 1) > 1e-6:
+                    raise ValueError("up is no unit vector")
+            tolerance = float(arrays["tolerance"][0])
+            if not 0 <= tolerance <= float(np.ptp(mesh.vertices, axis=0).max()):
+                raise ValueError(f"a tolerance of {tolerance:g}, larger than the container or negative")
+            return cls(mesh, tolerance, room, up)
         except (ValueError, IndexError) as error:
             raise SplashbenchError(f"{path} is not a container ({error}); fit the scene again") from None

@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 from skimage.measure import find_contours
 
+from splashbench.background.depth import lift
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.scene import TrainingScene
 
@@ -191,10 +192,9 @@ def _edge(wall: NearWall, liquid: np.ndarray, mesh: ContainerMesh, up: np.ndarra
     last = np.array(wall.share.shape) - 1
     row, column = np.clip(np.rint(points - outwards), 0, last).astype(int).T
     depth = wall.depth[row, column]
-    pixels = np.stack([points[:, 1] + 0.5, points[:, 0] + 0.5, np.ones(len(points))])
-    camera = wall.camera
-    local = np.linalg.solve(camera.K, pixels).T * np.where(np.isfinite(depth), depth, 0.0)[:, None]
-    at = (local - camera.w2c[:3, 3]) @ camera.w2c[:3, :3]
+    shown = np.isfinite(depth)
+    points, outwards = points[shown], outwards[shown]
+    at = lift(wall.camera, points[:, ::-1] + 0.5, 1 / depth[shown])
     heights = mesh.vertices @ up
     deepest = heights.max() - _RIM_SHARE * np.ptp(heights)
     search = max(_SEARCH, _SEARCH_SHARE * max(wall.share.shape))
@@ -205,7 +205,7 @@ def _edge(wall: NearWall, liquid: np.ndarray, mesh: ContainerMesh, up: np.ndarra
     wet = liquid[row, column] & within
     several = round(1 / _STEP)
     ends = wet[:, -several:].all(axis=1) & ~wet[:, : several // 2].any(axis=1)
-    used = ends & np.isfinite(depth) & (at @ up >= deepest)
+    used = ends & (at @ up >= deepest)
     if not used.any():
         return None
     offsets = search - _STEP * (wet[used].sum(axis=1) - 0.5)

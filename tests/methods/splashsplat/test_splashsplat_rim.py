@@ -212,6 +212,13 @@ def test_the_files_keep_the_edge(tmp_path: Path) -> None:
     assert np.array_equal(kept.share, read.share)
     with np.load(tmp_path / "container.npz") as stored:
         arrays = dict(stored)
-    np.savez(tmp_path / "container.npz", **{**arrays, "room": arrays["room"][1:]})
-    with pytest.raises(SplashbenchError, match="do not fit together"):
-        LiquidOcclusion.load(tmp_path)
+    for name, value, words in (
+        ("room", arrays["room"][1:], "do not fit together"),
+        ("room", None, "only one of"),
+        ("up", np.zeros(3), "no unit vector"),
+        ("tolerance", np.array([1e9]), "larger than the container"),
+    ):
+        changed = {key: array for key, array in (arrays | {name: value}).items() if array is not None}
+        np.savez(tmp_path / "container.npz", **changed)
+        with pytest.raises(SplashbenchError, match=words):
+            LiquidOcclusion.load(tmp_path)
