@@ -17,7 +17,6 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 from skimage.measure import find_contours
 
-from splashbench.background.depth import lift
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.scene import TrainingScene
 
@@ -194,7 +193,10 @@ def _edge(wall: NearWall, liquid: np.ndarray, mesh: ContainerMesh, up: np.ndarra
     depth = wall.depth[row, column]
     shown = np.isfinite(depth)
     points, outwards = points[shown], outwards[shown]
-    at = lift(wall.camera, points[:, ::-1] + 0.5, 1 / depth[shown])
+    camera = wall.camera
+    pixels = np.column_stack([points[:, ::-1] + 0.5, np.ones(len(points))])
+    local = np.linalg.solve(camera.K, pixels.T).T * depth[shown][:, None]
+    at = (local - camera.w2c[:3, 3]) @ camera.w2c[:3, :3]
     heights = mesh.vertices @ up
     deepest = heights.max() - _RIM_SHARE * np.ptp(heights)
     search = max(_SEARCH, _SEARCH_SHARE * max(wall.share.shape))
