@@ -69,7 +69,7 @@ def fit_liquid(
         occlusion = occlusion.uncut()  # the background's Gaussians hide what is behind them themselves
     with run.stage("appearance"), one_torch_thread():
         track = Track(observations.grid, carriers, motion, packed)
-        appearance = _fit_appearance(
+        appearance, left = _fit_appearance(
             track,
             observations,
             occlusion,
@@ -80,7 +80,7 @@ def fit_liquid(
             run.seed,
             lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
         )
-        carriers, appearance = _pruned(carriers, appearance, config.prune_opacity)
+        carriers, appearance = _pruned(carriers, appearance, left & visible_carriers(appearance, config.prune_opacity))
     # What moves the carriers of the other variants is not u_t.
     carried = config.variant in ("full", "no_resampling")
     composition = config.composition if frozen is not None else "over"
@@ -186,8 +186,9 @@ def _fit_appearance(
     config: SplashSplatConfig,
     seed: int,
     progress: Callable[[float], None],
-) -> Appearance:
-    """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail."""
+) -> tuple[Appearance, np.ndarray]:
+    """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; and which of them
+    were fitted to the end, bool [count]."""
     voxel = observations.grid.voxel
     appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
     targets = collect_targets(
@@ -201,13 +202,15 @@ def _fit_appearance(
         cut=None if occlusion is None else lambda name, points: occlusion.cut(scene.cameras[name], points),
         frozen=frozen,
     )
-    if targets:
-        color_cell = observations.hull_grid.voxel / voxel
-        fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress)
-    return appearance
+    if not targets:
+        return appearance, np.ones(track.carriers.count, dtype=bool)
+    color_cell = observations.hull_grid.voxel / voxel
+    fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress)
+    return appearance, fit.left
 
 
-def _pruned(carriers: Carriers, appearance: Appearance, threshold: float) -> tuple[Carriers, Appearance]:
-    """Without the carriers that the images made transparent: the phantom volume of the hull."""
-    carriers, rows = carriers.keep(visible_carriers(appearance, threshold))
+def _pruned(carriers: Carriers, appearance: Appearance, kept: np.ndarray) -> tuple[Carriers, Appearance]:
+    """The carriers `kept` (bool [count]) alone: without phantom volume of the hull, which the images made transparent,
+    and without what they do not show."""
+    carriers, rows = carriers.keep(kept)
     return carriers, Appearance(appearance.features[rows], appearance.log_scales[rows], appearance.decoder)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "8"
+VERSION = "9"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -89,7 +89,7 @@ class SplashSplatConfig(MethodConfig):
     #: how far from the surface a carrier is born for a pixel of a mask that no liquid covers; 0 for none
     coverage_reach: float = Field(4.0, ge=0)
     min_per_cell: PositiveInt = 2
-    max_per_cell: PositiveInt = 6
+    max_per_cell: PositiveInt = 4
     #: of cells deeper than 3 voxels; None for as many as elsewhere
     interior_per_cell: PositiveInt | None = 1
     #: no carriers where no training view can see them
@@ -141,6 +141,8 @@ class SplashSplatConfig(MethodConfig):
     #: carriers whose learned opacity falls below this are dropped, eight times during the fit and at its end; 0 keeps
     #: all
     prune_opacity: float = Field(0.01, ge=0, lt=1)
+    #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
+    idle_share: float = Field(0.02, ge=0, lt=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
 
@@ -200,6 +202,7 @@ class SplashSplatConfig(MethodConfig):
             "between_frames": "forward",
             "validation_share": 0.0,
             "prune_opacity": 0.0,
+            "idle_share": 0.0,
             "background_preset": "paper",
         },
         "quick": {
@@ -310,6 +313,7 @@ class SplashSplatConfig(MethodConfig):
             ssim_every=self.ssim_every,
             base_scale=self.base_scale,
             prune_opacity=self.prune_opacity,
+            idle_share=self.idle_share,
             weights=LossWeights(
                 foreground=self.foreground_weight,
                 gradient=self.gradient_weight,

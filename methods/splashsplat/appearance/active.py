@@ -1,11 +1,13 @@
-"""Which carriers of a frame one photograph teaches: those that its view may see, and that are not transparent yet.
+"""Which carriers of a frame one photograph teaches: those that its view may see, and that make up some of it.
 
 The shell below the hull's surface is deep, and much of it is phantom volume. The images make its carriers transparent
-within the first part of the fit, and decoding them on would cost as much as decoding the others.
+within the first part of the fit. Others lie behind opaque liquid. Decoding them on would cost as much as decoding what
+is seen.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +48,8 @@ class ActiveCarriers:
         self._cells = [_cells(track, t, color_cell) for t in frames]
         # Of each frame's carriers in the track those that are left; None for all.
         self._left: list[Tensor | None] = [None for _ in frames]
+        # By the target's identity: bool, which of its frame's carriers in the track make up none of it.
+        self._idle: dict[int, Tensor] = {}
 
     def of(self, target: TrainingTarget) -> Active:
         """What `target` teaches."""
@@ -54,10 +58,12 @@ class ActiveCarriers:
         if target.fraction:
             state = _part(self._track.state(t, target.fraction), left)
         places, visibility = None, None
+        shown = self._shown(target)
+        if shown is not None:
+            places = chosen(shown, left).nonzero()[:, 0]
         if target.hidden is not None:
-            hidden = chosen(target.hidden, left)
-            places = (hidden < HIDDEN).nonzero()[:, 0]
-            visibility = 1 - hidden.index_select(0, places).to(torch.float32) / HIDDEN
+            hidden = chosen(chosen(target.hidden, left), places)
+            visibility = 1 - hidden.to(torch.float32) / HIDDEN
         state = replace(_part(state, places), visibility=visibility)
         numbers = chosen(self._cells[t], places)
         # Cells of which none is left count one, as nothing may be divided by zero.
@@ -65,11 +71,43 @@ class ActiveCarriers:
         in_front = None if target.in_front is None else chosen(chosen(target.in_front, left), places)
         return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes), in_front)
 
-    def drop(self, transparent: Tensor) -> None:
-        """Leave out the carriers `transparent` (bool [count]) from now on."""
+    def _shown(self, target: TrainingTarget) -> Tensor | None:
+        """bool, which carriers of the target's frame in the track it teaches; None for all."""
+        idle = self._idle.get(id(target))
+        if target.hidden is None:
+            return None if idle is None else ~idle
+        seen = target.hidden < HIDDEN
+        return seen if idle is None else seen & ~idle
+
+    def focus(self, idle: Callable[[TrainingTarget, Active], Tensor], targets: Sequence[TrainingTarget]) -> None:
+        """From now on each of `targets` teaches only those of its carriers that are not `idle` (bool, of the active
+        ones), and what no target teaches is left out. What was idle before is looked at again."""
+        self._idle = {}
+        taught = np.zeros(self._track.carriers.count, dtype=bool)
+        for target in targets:
+            active = self.of(target)
+            useless = idle(target, active)
+            taught[active.ids.numpy()[~useless.numpy()]] = True
+            places = torch.arange(len(active.ids)) if active.places is None else active.places
+            places = places.index_select(0, useless.nonzero()[:, 0])
+            left = self._left[target.frame]
+            places = places if left is None else left.index_select(0, places)
+            in_frame = torch.zeros(len(self._track.ids(target.frame)), dtype=torch.bool)
+            self._idle[id(target)] = in_frame.index_fill_(0, places, True)
+        self.drop(torch.from_numpy(~taught))
+
+    def left(self, count: int) -> np.ndarray:
+        """bool [count]: the carriers that are in any frame."""
+        left = np.zeros(count, dtype=bool)
+        for ids in self.ids:
+            left[ids.numpy()] = True
+        return left
+
+    def drop(self, idle: Tensor) -> None:
+        """Leave out the carriers `idle` (bool [count]) from now on."""
         self.ids = list(self.ids)
         for t, ids in enumerate(self.ids):
-            left = (~transparent.index_select(0, ids)).nonzero()[:, 0]
+            left = (~idle.index_select(0, ids)).nonzero()[:, 0]
             before = self._left[t]
             self._left[t] = left if before is None else before.index_select(0, left)
             self.ids[t] = ids.index_select(0, left)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..carriers.subframe import Track
 from ..kernel.window_loss import window_losses
 from . import losses
 from .active import Active, ActiveCarriers
+from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .optimizer import RowAdam
 from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
@@ -38,6 +39,10 @@ _LOOK_EVERY = 100
 _FALL = 0.5
 # When transparent carriers are left out, as shares of the iterations: not in the last fifth, which makes up for them.
 _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
+# When it is looked at anew what makes up each photograph, likewise; and not before each was seen so many times: until
+# then opacities say little.
+_FOCUSINGS = (0.2, 0.4, 0.6, 0.8)
+_SEEN_BEFORE = 4
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,7 @@ class FitSettings:
     ssim_every: int = 1
     base_scale: float = 0.35
     prune_opacity: float = 0.0
+    idle_share: float = 0.0
     weights: losses.LossWeights = field(default_factory=losses.LossWeights)
 
 
@@ -75,6 +81,14 @@ class Appearance:
     features: Tensor
     log_scales: Tensor
     decoder: Decoder
+
+
+@dataclass(frozen=True)
+class Fit:
+    """losses: of every iteration. left: bool [count], the carriers that were fitted to the end."""
+
+    losses: list[float]
+    left: np.ndarray
 
 
 def initial_appearance(
@@ -177,8 +191,8 @@ def fit_appearance(
     color_cell: float,
     seed: int,
     progress: Callable[[float], None],
-) -> list[float]:
-    """Fit `appearance` in place; the loss of every iteration is returned. `color_cell`: in transport voxels.
+) -> Fit:
+    """Fit `appearance` in place. `color_cell`: in transport voxels.
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -207,15 +221,17 @@ def fit_appearance(
         if withheld_targets.any() or not adaptive.may_stop:
             schedule = adaptive
 
+    def shown(children: Children, target: TrainingTarget, active: Active) -> tuple[Tensor, Tensor]:
+        return composite(
+            children, target.camera, target.background, target.frozen, target.modes, target.wall, active.in_front
+        )
+
     def seen(
         target: TrainingTarget, active: Active, values: list[Tensor], penalised: bool
     ) -> tuple[Tensor, Tensor, Penalties | None]:
         cells = active.cells if penalised else None
         children, penalty_terms = decoder.decode(values[0], values[1], None, active.state, target.eye, cells)
-        images = composite(
-            children, target.camera, target.background, target.frozen, target.modes, target.wall, active.in_front
-        )
-        return *images, penalty_terms
+        return *shown(children, target, active), penalty_terms
 
     def learned(t: int, active: Active) -> list[Tensor]:
         return [features.of_frame(t, active.places), appearance.log_scales.index_select(0, active.ids)]
@@ -230,7 +246,18 @@ def fit_appearance(
             total += float(image_loss(image, alpha, target, weights, weights.ssim))
         return total / int(withheld_targets.sum())
 
+    @torch.no_grad()
+    def idle(target: TrainingTarget, active: Active) -> Tensor:
+        feature_rows, scale_rows = learned(target.frame, active)
+        children, _ = decoder.decode(feature_rows, scale_rows, None, active.state, target.eye)
+
+        def drawn(colors: Tensor) -> Tensor:
+            return shown(replace(children, colors=colors), target, active)[0]
+
+        return least(contributions(children.colors, drawn), settings.idle_share)
+
     prunings = {round(share * settings.iterations) for share in _PRUNINGS}
+    focusings = {round(share * settings.iterations) for share in _FOCUSINGS}
     queue: list[int] = []
     history: list[float] = []
     iteration = 0
@@ -245,6 +272,9 @@ def fit_appearance(
             queue = rng.permutation(fitted).tolist()
         if settings.prune_opacity > 0 and iteration in prunings:
             carriers.drop(decoder.mean_opacity(features.all()).detach() < settings.prune_opacity)
+            features.keep(carriers.ids)
+        if settings.idle_share > 0 and iteration in focusings and iteration >= _SEEN_BEFORE * len(targets):
+            carriers.focus(idle, targets)
             features.keep(carriers.ids)
         target = targets[queue.pop()]
         active = carriers.of(target)
@@ -271,7 +301,7 @@ def fit_appearance(
         iteration += 1
         progress(schedule.done(iteration))
     appearance.features = features.all()
-    return history
+    return Fit(history, carriers.left(track.carriers.count))
 
 
 @torch.no_grad()

@@ -5,8 +5,10 @@ import pytest
 import torch
 
 from splashbench.observe.grid import Grid
+from splashbench.render import rasterize
 from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance.active import ActiveCarriers
+from splashbench_methods.splashsplat.appearance.contribution import contributions, least
 from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, ScaleResidual
 from splashbench_methods.splashsplat.appearance.fitting import FitSettings, fit_appearance, initial_appearance
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
@@ -123,7 +125,66 @@ def test_photographs_that_teach_no_carrier_do_no_harm(
     heads = DecoderSettings(feature_size=4, children=1, scale_residual=residual)
     appearance = initial_appearance(4, 1.0, settings, heads, seed=0)
     targets = [_target(0, hidden=hidden), _target(1, hidden=hidden)]
-    losses = fit_appearance(appearance, _track(), targets, settings, 100.0, 0, lambda done: None)
+    losses = fit_appearance(appearance, _track(), targets, settings, 100.0, 0, lambda done: None).losses
     assert len(losses) == 10
     assert np.isfinite(losses).all()
     assert bool(torch.isfinite(appearance.features).all())
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25])
+def test_idle_carriers_of_a_photograph_are_left_out_of_it_alone(fraction: float) -> None:
+    carriers = ActiveCarriers(_track(), color_cell=4.0)
+    first, second = _target(0, fraction), _target(1, hidden=[0, 0, 255])
+    # 0 and 2 make up none of the first photograph; 2, unlike 0, is taught by the second. 3 is hidden from it.
+    carriers.focus(
+        lambda target, active: torch.isin(active.ids, torch.tensor([0, 2] if target is first else [])), [first, second]
+    )
+    assert carriers.of(first).ids.tolist() == [1]
+    np.testing.assert_allclose(carriers.of(first).state.positions[:, 0], [3 + fraction], atol=1e-3)
+    assert carriers.of(second).ids.tolist() == [1, 2]
+    assert carriers.of(_target(0)).ids.tolist() == [1, 2]
+    assert carriers.left(4).tolist() == [False, True, True, False]
+    # What was idle is looked at again.
+    carriers.focus(lambda target, active: torch.zeros(len(active.ids), dtype=torch.bool), [first, second])
+    assert carriers.of(first).ids.tolist() == [1, 2]
+
+
+def test_a_gaussian_behind_an_opaque_one_makes_up_little() -> None:
+    camera = _target().camera
+    means = torch.tensor([[5.0, 2, 0], [5.0, 2, 3], [0.0, 2, 3]])
+    sizes = torch.tensor([1.0, 0.3, 0.3])
+    shapes = means, sizes[:, None, None] * torch.eye(3), torch.tensor([0.99, 0.9, 0.9])
+    colors = torch.rand(3, 1, 3)
+    drawn = contributions(colors, lambda c: rasterize(*shapes, c[:, 0], camera, background=torch.zeros(3))[0])
+    alone = contributions(
+        colors[1:2],
+        lambda c: rasterize(*(s[1:2] for s in shapes), c[:, 0], camera, background=torch.zeros(3))[0],
+    )
+    assert drawn[1] < 0.2 * alone[0]
+    assert drawn[2] == pytest.approx(float(alone[0]), rel=0.1)
+
+
+def test_least_takes_no_more_than_the_share() -> None:
+    weights = torch.tensor([3.0, 0.0, 1.0, 96.0])
+    assert least(weights, 0.0).tolist() == [False, True, False, False]
+    assert least(weights, 0.01).tolist() == [False, True, True, False]
+    assert least(weights, 0.039).tolist() == [False, True, True, False]
+    assert least(weights, 0.04).tolist() == [True, True, True, False]
+    assert least(torch.zeros(0), 0.5).tolist() == []
+
+
+def _visible_after(idle_share: float, iterations: int) -> list[bool]:
+    """Which carriers are fitted to the end: 2 and 3 lie behind others, all opaque."""
+    settings = FitSettings(iterations=iterations, idle_share=idle_share, base_scale=2.0)
+    heads = DecoderSettings(feature_size=4, children=1, opacity_bias=6.0)
+    appearance = initial_appearance(4, 1.0, settings, heads, seed=0)
+    track = _track()
+    track.carriers.positions[[2, 4, 5]] = [[2, 2, 9], [4, 2, 9], [4.5, 2, 9]]
+    fit = fit_appearance(appearance, track, [_target(0), _target(1)], settings, 100.0, 0, lambda done: None)
+    return fit.left.tolist()
+
+
+def test_carriers_idle_in_all_photographs_are_left_out_once_all_were_seen() -> None:
+    assert all(_visible_after(0.0, 40))
+    assert _visible_after(0.1, 40) == [True, True, False, False]
+    assert all(_visible_after(0.1, 9))  # the photographs were not seen four times by the last look

@@ -1,0 +1,37 @@
+"""How much of a photograph each carrier makes up: the pixels that its Gaussians cover, weighted by how far they show.
+
+A Gaussian's weight in a pixel is its opacity there times the light that those in front let through. Summed over pixels
+this is the derivative of a rendered channel by the Gaussian's colour, so that one backward pass gives the weights of
+all. Carriers deep in the liquid weigh next to nothing. To fit them to the photograph costs as much as any other, and
+Adam, which knows no small gradients, makes them wander. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@torch.enable_grad()
+def contributions(colors: Tensor, drawn: Callable[[Tensor], Tensor]) -> Tensor:
+    """Pixels that each of n carriers makes up, float32 [n].
+
+    colors: [n, K, 3], of their K Gaussians each. drawn: the image [h, w, 3] of the Gaussians in other colours.
+    """
+    colors = colors.detach().clone().requires_grad_()
+    (weights,) = torch.autograd.grad(drawn(colors)[..., 0].sum(), [colors])
+    return weights[..., 0].sum(dim=1)
+
+
+def least(weights: Tensor, share: float) -> Tensor:
+    """bool [n]: the smallest of `weights` [n], as many as together are at most `share` of all."""
+    values = weights.numpy().astype(np.float64)
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(values[order])
+    chosen = np.zeros(len(values), dtype=bool)
+    if len(values):
+        chosen[order[sums <= share * sums[-1]]] = True
+    return torch.from_numpy(chosen)
