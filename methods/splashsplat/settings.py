@@ -89,7 +89,7 @@ class SplashSplatConfig(MethodConfig):
     #: how far from the surface a carrier is born for a pixel of a mask that no liquid covers; 0 for none
     coverage_reach: float = Field(4.0, ge=0)
     min_per_cell: PositiveInt = 2
-    max_per_cell: PositiveInt = 4
+    max_per_cell: PositiveInt = 6
     #: of cells deeper than 3 voxels; None for as many as elsewhere
     interior_per_cell: PositiveInt | None = 1
     #: no carriers where no training view can see them
