@@ -81,12 +81,13 @@ class ActiveCarriers:
 
     def focus(self, idle: Callable[[TrainingTarget, Active], Tensor], targets: Sequence[TrainingTarget]) -> None:
         """From now on each of `targets` teaches only those of its carriers that are not `idle` (bool, of the active
-        ones), and what no target teaches is left out. What was idle before is looked at again."""
+        ones). Carriers that are idle in all of theirs are left out. What was idle in some is looked at again."""
         self._idle = {}
-        taught = np.zeros(self._track.carriers.count, dtype=bool)
+        found, taught = (np.zeros(self._track.carriers.count, dtype=bool) for _ in range(2))
         for target in targets:
             active = self.of(target)
             useless = idle(target, active)
+            found[active.ids.numpy()] = True
             taught[active.ids.numpy()[~useless.numpy()]] = True
             places = torch.arange(len(active.ids)) if active.places is None else active.places
             places = places.index_select(0, useless.nonzero()[:, 0])
@@ -94,7 +95,8 @@ class ActiveCarriers:
             places = places if left is None else left.index_select(0, places)
             in_frame = torch.zeros(len(self._track.ids(target.frame)), dtype=torch.bool)
             self._idle[id(target)] = in_frame.index_fill_(0, places, True)
-        self.drop(torch.from_numpy(~taught))
+        # Those of frames without any photograph are shown all the same: they look like their neighbours.
+        self.drop(torch.from_numpy(found & ~taught))
 
     def left(self, count: int) -> np.ndarray:
         """bool [count]: the carriers that are in any frame."""

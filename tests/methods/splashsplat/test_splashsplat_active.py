@@ -7,7 +7,7 @@ import torch
 from splashbench.observe.grid import Grid
 from splashbench.render import rasterize
 from splashbench.scene.camera import Camera, look_at
-from splashbench_methods.splashsplat.appearance.active import ActiveCarriers
+from splashbench_methods.splashsplat.appearance.active import Active, ActiveCarriers
 from splashbench_methods.splashsplat.appearance.contribution import contributions, least
 from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, ScaleResidual
 from splashbench_methods.splashsplat.appearance.fitting import FitSettings, fit_appearance, initial_appearance
@@ -135,18 +135,25 @@ def test_photographs_that_teach_no_carrier_do_no_harm(
 def test_idle_carriers_of_a_photograph_are_left_out_of_it_alone(fraction: float) -> None:
     carriers = ActiveCarriers(_track(), color_cell=4.0)
     first, second = _target(0, fraction), _target(1, hidden=[0, 0, 255])
+
     # 0 and 2 make up none of the first photograph; 2, unlike 0, is taught by the second. 3 is hidden from it.
-    carriers.focus(
-        lambda target, active: torch.isin(active.ids, torch.tensor([0, 2] if target is first else [])), [first, second]
-    )
+    def useless(target: TrainingTarget, active: Active) -> torch.Tensor:
+        return torch.isin(active.ids, torch.tensor([0, 2] if target is first else []))
+
+    carriers.focus(useless, [first, second])
     assert carriers.of(first).ids.tolist() == [1]
     np.testing.assert_allclose(carriers.of(first).state.positions[:, 0], [3 + fraction], atol=1e-3)
     assert carriers.of(second).ids.tolist() == [1, 2]
     assert carriers.of(_target(0)).ids.tolist() == [1, 2]
-    assert carriers.left(4).tolist() == [False, True, True, False]
     # What was idle is looked at again.
     carriers.focus(lambda target, active: torch.zeros(len(active.ids), dtype=torch.bool), [first, second])
     assert carriers.of(first).ids.tolist() == [1, 2]
+
+
+def test_carriers_that_no_photograph_could_teach_stay() -> None:
+    carriers = ActiveCarriers(_track(), color_cell=4.0)
+    carriers.focus(lambda target, active: torch.ones(len(active.ids), dtype=torch.bool), [_target(0)])
+    assert carriers.left(4).tolist() == [False, False, False, True]
 
 
 def test_a_gaussian_behind_an_opaque_one_makes_up_little() -> None:
