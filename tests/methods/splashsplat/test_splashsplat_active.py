@@ -121,7 +121,7 @@ def test_a_transparent_carrier_is_not_fitted_any_further() -> None:
 def test_photographs_that_teach_no_carrier_do_no_harm(
     prune_opacity: float, hidden: list[int] | None, residual: ScaleResidual
 ) -> None:
-    settings = FitSettings(iterations=10, feature_cells=(4.0,), prune_opacity=prune_opacity)
+    settings = FitSettings(iterations=10, feature_cells=(4.0,), prune_opacity=prune_opacity, idle_share=0.02)
     heads = DecoderSettings(feature_size=4, children=1, scale_residual=residual)
     appearance = initial_appearance(4, 1.0, settings, heads, seed=0)
     targets = [_target(0, hidden=hidden), _target(1, hidden=hidden)]
