@@ -48,8 +48,8 @@ class ActiveCarriers:
         self._cells = [_cells(track, t, color_cell) for t in frames]
         # Of each frame's carriers in the track those that are left; None for all.
         self._left: list[Tensor | None] = [None for _ in frames]
-        # By the target's identity: bool, which of its frame's carriers in the track make up none of it.
-        self._idle: dict[int, Tensor] = {}
+        # By the target's identity: bool, which of its frame's carriers in the track make up some of it.
+        self._focus: dict[int, Tensor] = {}
 
     def of(self, target: TrainingTarget) -> Active:
         """What `target` teaches."""
@@ -73,28 +73,25 @@ class ActiveCarriers:
 
     def _shown(self, target: TrainingTarget) -> Tensor | None:
         """bool, which carriers of the target's frame in the track it teaches; None for all."""
-        idle = self._idle.get(id(target))
-        if target.hidden is None:
-            return None if idle is None else ~idle
-        seen = target.hidden < HIDDEN
-        return seen if idle is None else seen & ~idle
+        if id(target) in self._focus:
+            return self._focus[id(target)]
+        return None if target.hidden is None else target.hidden < HIDDEN
 
     def focus(self, idle: Callable[[TrainingTarget, Active], Tensor], targets: Sequence[TrainingTarget]) -> None:
         """From now on each of `targets` teaches only those of its carriers that are not `idle` (bool, of the active
         ones). Carriers that are idle in all of theirs are left out. What was idle in some is looked at again."""
-        self._idle = {}
+        self._focus = {}
         found, taught = (np.zeros(self._track.carriers.count, dtype=bool) for _ in range(2))
         for target in targets:
             active = self.of(target)
-            useless = idle(target, active)
+            useful = (~idle(target, active)).nonzero()[:, 0]
             found[active.ids.numpy()] = True
-            taught[active.ids.numpy()[~useless.numpy()]] = True
-            places = torch.arange(len(active.ids)) if active.places is None else active.places
-            places = places.index_select(0, useless.nonzero()[:, 0])
+            taught[chosen(active.ids, useful).numpy()] = True
+            places = useful if active.places is None else chosen(active.places, useful)
             left = self._left[target.frame]
-            places = places if left is None else left.index_select(0, places)
             in_frame = torch.zeros(len(self._track.ids(target.frame)), dtype=torch.bool)
-            self._idle[id(target)] = in_frame.index_fill_(0, places, True)
+            in_frame[places if left is None else chosen(left, places)] = True
+            self._focus[id(target)] = in_frame
         # Those of frames without any photograph are shown all the same: they look like their neighbours.
         self.drop(torch.from_numpy(found & ~taught))
 

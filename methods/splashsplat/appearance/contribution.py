@@ -3,14 +3,13 @@
 A Gaussian's weight in a pixel is its opacity there times the light that those in front let through. Summed over pixels
 this is the derivative of a rendered channel by the Gaussian's colour, so that one backward pass gives the weights of
 all. Carriers deep in the liquid weigh next to nothing. To fit them to the photograph costs as much as any other, and
-Adam, which knows no small gradients, makes them wander. Not in the paper.
+Adam's steps do not shrink with the gradient. Not in the paper.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,10 +27,8 @@ def contributions(colors: Tensor, drawn: Callable[[Tensor], Tensor]) -> Tensor:
 
 def least(weights: Tensor, share: float) -> Tensor:
     """bool [n]: the smallest of `weights` [n], as many as together are at most `share` of all."""
-    values = weights.numpy().astype(np.float64)
-    order = np.argsort(values, kind="stable")
-    sums = np.cumsum(values[order])
-    chosen = np.zeros(len(values), dtype=bool)
-    if len(values):
-        chosen[order[sums <= share * sums[-1]]] = True
-    return torch.from_numpy(chosen)
+    values, order = weights.to(torch.float64).sort(stable=True)
+    sums = values.cumsum(0)
+    chosen = torch.zeros(len(weights), dtype=torch.bool)
+    chosen[order[sums <= share * sums[-1:]]] = True
+    return chosen

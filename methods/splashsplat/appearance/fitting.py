@@ -250,9 +250,11 @@ def fit_appearance(
     def idle(target: TrainingTarget, active: Active) -> Tensor:
         feature_rows, scale_rows = learned(target.frame, active)
         children, _ = decoder.decode(feature_rows, scale_rows, None, active.state, target.eye)
+        # Colours of all tiles: liquid drawn beside the mask is to be taught that it does not belong there.
+        whole = replace(target, modes=None)
 
         def drawn(colors: Tensor) -> Tensor:
-            return shown(replace(children, colors=colors), target, active)[0]
+            return shown(replace(children, colors=colors), whole, active)[0]
 
         return least(contributions(children.colors, drawn), settings.idle_share)
 

@@ -1,11 +1,13 @@
 """Whom a photograph teaches: carriers that its view may see, as long as they are not transparent."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from splashbench.observe.grid import Grid
-from splashbench.render import rasterize
+from splashbench.render import freeze, rasterize, tile_modes
 from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance.active import Active, ActiveCarriers
 from splashbench_methods.splashsplat.appearance.contribution import contributions, least
@@ -195,3 +197,19 @@ def test_carriers_idle_in_all_photographs_are_left_out_once_all_were_seen() -> N
     assert all(_visible_after(0.0, 40))
     assert _visible_after(0.1, 40) == [True, True, False, False]
     assert all(_visible_after(0.1, 9))  # the photographs were not seen four times by the last look
+
+
+def test_liquid_beside_the_masks_is_not_idle_where_it_is_drawn_together_with_the_background() -> None:
+    gaussian = np.array([[5, 2, 400.0]]), np.eye(3)[None], np.array([0.5]), np.ones((1, 3))
+    apart = [
+        replace(
+            target,
+            background=torch.zeros(3),
+            frozen=freeze(*(values.astype(np.float32) for values in gaussian), target.camera),
+            modes=tile_modes(np.zeros((16, 16), dtype=bool)),
+        )
+        for target in (_target(0), _target(1))
+    ]
+    settings = FitSettings(iterations=10, idle_share=0.02)
+    appearance = initial_appearance(4, 1.0, settings, DecoderSettings(feature_size=4, children=1), seed=0)
+    assert fit_appearance(appearance, _track(), apart, settings, 100.0, 0, lambda done: None).left.all()
