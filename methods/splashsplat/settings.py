@@ -142,7 +142,7 @@ class SplashSplatConfig(MethodConfig):
     #: all
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
-    idle_share: float = Field(0.02, ge=0, lt=1)
+    idle_share: float = Field(0.02, ge=0, le=0.2)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
 
