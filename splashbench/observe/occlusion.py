@@ -7,7 +7,7 @@ outline where the view sees, and does not break off where the container begins.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -40,13 +40,15 @@ def focal_length(camera: Camera) -> float:
 class ContainerOcclusion:
     """The container as carving needs it.
 
-    mesh: in scene units. gravity: unit vector [3] or None; where known, no liquid lies deeper than the mesh's lowest
-    point, on which the container stands. hides: False for a transparent container, which blocks no line of sight.
+    mesh: in scene units. gravity: unit vector [3] or None; where known, no liquid lies deeper than `floor`.
+    hides: False for a transparent container, which blocks no line of sight. foot: position along gravity (scene units)
+    of what the container stands on; None for the mesh's lowest point.
     """
 
     mesh: ContainerMesh
     gravity: np.ndarray | None = None
     hides: bool = True
+    foot: float | None = None
 
     @classmethod
     def of(cls, scene: Scene | TrainingScene) -> ContainerOcclusion | None:
@@ -56,11 +58,26 @@ class ContainerOcclusion:
             return None
         return cls(mesh, scene.gravity, hides=not scene.container_transparent)
 
+    def with_mesh(self, mesh: ContainerMesh) -> ContainerOcclusion:
+        """The same container with its walls in another place: what it stands on is not lifted with them, and droplets
+        that lie there are not forbidden."""
+        moved = replace(self, mesh=mesh)
+        if self.floor is None or moved.floor is None:
+            return moved
+        return replace(moved, foot=max(self.floor, moved.floor))
+
+    @property
+    def floor(self) -> float | None:
+        """Position along gravity (scene units) below which no liquid lies; None where gravity is not known."""
+        if self.gravity is None or self.foot is not None:
+            return self.foot
+        return float((self.mesh.vertices @ self.gravity).max())
+
     def forbidden(self, grid: Grid) -> np.ndarray:
         """Signed distance, in voxels, into where the container allows liquid: > 0 in its walls and below its foot."""
         distance = -solid_distance(self.mesh, grid)
-        if self.gravity is not None:
-            floor = float((self.mesh.vertices @ self.gravity).max())
+        floor = self.floor
+        if self.gravity is not None and floor is not None:
             i, j, k = (np.arange(n) * grid.voxel * g for n, g in zip(grid.shape, self.gravity))
             start = float(grid.origin @ self.gravity) - floor
             depth = (start + i[:, None, None] + j[:, None] + k) / grid.voxel

@@ -189,6 +189,23 @@ def test_nothing_is_liquid_in_a_wall_or_below_the_foot() -> None:
     assert sequence_bounds(scene, floor).low[1] == pytest.approx(0.1, abs=0.01)
 
 
+def test_walls_that_are_moved_leave_the_floor_to_droplets() -> None:
+    scene, down = BallBehindAWall(), np.array([0.0, -1.0, 0.0])
+    plate = ContainerOcclusion(box((-1, 0.1, -1), (1, 0.2, 1)), down, hides=False)
+    grid = Grid.over(Bounds(np.full(3, -0.3), np.full(3, 0.3)), 24)
+    lifted, lowered = (plate.with_mesh(box((-1, y, -1), (1, y + 0.1, 1))) for y in (0.15, 0.02))
+    assert lifted.floor == pytest.approx(-0.1)
+    assert lowered.floor == pytest.approx(-0.02)
+    y = nodes(grid)[..., 1]
+    for moved, low, high in ((lifted, 0.1, 0.15), (lowered, 0.02, 0.02)):
+        forbidden = moved.forbidden(grid)
+        assert (forbidden[y < low - 1e-6] > 0).all()
+        assert (forbidden[(y > low + 1e-6) & (y < high - 1e-6)] <= 0).all()
+    without = ContainerOcclusion(plate.mesh).with_mesh(box((-1, 0.15, -1), (1, 0.25, 1)))
+    assert without.floor is None
+    assert sequence_bounds(scene, lifted).low[1] == pytest.approx(0.1, abs=0.01)
+
+
 def test_a_view_must_see_a_point_and_two_where_asked_for() -> None:
     scene = BallBehindAWall()
     grid = Grid.over(Bounds(np.full(3, -0.3), np.full(3, 0.3)), 24)

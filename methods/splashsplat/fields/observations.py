@@ -8,7 +8,7 @@ The runs of one study share both (`Run.reuse`): they are most of a short fit, an
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from .rim import rim_of
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 6
+_REVISION = 7
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
         with run.stage("rim"):
             rim = rim_of(known, scene, silhouettes.failed_masks)
         run.note("rim", str(rim))
-        container = replace(container, mesh=rim.mesh)
+        container = container.with_mesh(rim.mesh)
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
     hull_grid, grid = Grid.over(bounds, settings.hull_cells), Grid.over(bounds, settings.transport_cells)
     occlusion = None
