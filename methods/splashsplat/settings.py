@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "9"
+VERSION = "10"
 
 
 class SplashSplatConfig(MethodConfig):

@@ -29,6 +29,10 @@ _PER_PIXEL = 8
 _FARTHEST_PIXELS = 4000.0
 # Voxels behind the mesh's surface where it begins to hide, for errors of the mesh and of its place.
 _TOLERANCE_VOXELS = 1.0
+# Voxels below the floor from which nothing is liquid: droplets that lie on it are thinner than a voxel, and cut at the
+# floor itself they would fall between the nodes. Beneath a transparent container the liquid in it would seem to reach
+# as deep; beneath others no view sees anything.
+_FLOOR_VOXELS = 1.0
 
 
 def focal_length(camera: Camera) -> float:
@@ -40,7 +44,7 @@ def focal_length(camera: Camera) -> float:
 class ContainerOcclusion:
     """The container as carving needs it.
 
-    mesh: in scene units. gravity: unit vector [3] or None; where known, no liquid lies deeper than `floor`.
+    mesh: in scene units. gravity: unit vector [3] or None; where known, no liquid lies below `floor`.
     hides: False for a transparent container, which blocks no line of sight. foot: position along gravity (scene units)
     of what the container stands on; None for the mesh's lowest point.
     """
@@ -68,18 +72,19 @@ class ContainerOcclusion:
 
     @property
     def floor(self) -> float | None:
-        """Position along gravity (scene units) below which no liquid lies; None where gravity is not known."""
+        """Position along gravity (scene units) of what liquid cannot fall through; None where gravity is not known."""
         if self.gravity is None or self.foot is not None:
             return self.foot
         return float((self.mesh.vertices @ self.gravity).max())
 
     def forbidden(self, grid: Grid) -> np.ndarray:
-        """Signed distance, in voxels, into where the container allows liquid: > 0 in its walls and below its foot."""
+        """Signed distance, in voxels, into where the container allows liquid: > 0 in its walls and below its floor; of
+        an opaque container from a voxel below."""
         distance = -solid_distance(self.mesh, grid)
         floor = self.floor
         if self.gravity is not None and floor is not None:
             i, j, k = (np.arange(n) * grid.voxel * g for n, g in zip(grid.shape, self.gravity))
-            start = float(grid.origin @ self.gravity) - floor
+            start = float(grid.origin @ self.gravity) - floor - (_FLOOR_VOXELS * grid.voxel if self.hides else 0.0)
             depth = (start + i[:, None, None] + j[:, None] + k) / grid.voxel
             np.maximum(distance, depth.astype(np.float32), out=distance)
         return np.clip(distance, -LIMIT_VOXELS, LIMIT_VOXELS)

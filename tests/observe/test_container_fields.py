@@ -189,6 +189,17 @@ def test_nothing_is_liquid_in_a_wall_or_below_the_foot() -> None:
     assert sequence_bounds(scene, floor).low[1] == pytest.approx(0.1, abs=0.01)
 
 
+def test_droplets_thinner_than_a_voxel_lie_on_the_floor() -> None:
+    down = np.array([0.0, -1.0, 0.0])
+    grid = Grid.over(Bounds(np.full(3, -0.3), np.full(3, 0.3)), 24)
+    y = nodes(grid)[..., 1]
+    for hides, lowest in ((True, 0.1 - grid.voxel), (False, 0.1)):
+        plate = ContainerOcclusion(box((0.9, 0.1, 0.9), (1, 0.2, 1)), down, hides)
+        forbidden = plate.forbidden(grid)
+        assert (forbidden[y < lowest - 1e-6] > 0).all()
+        assert (forbidden[y > lowest + 1e-6] <= 0).all()
+
+
 def test_walls_that_are_moved_leave_the_floor_to_droplets() -> None:
     scene, down = BallBehindAWall(), np.array([0.0, -1.0, 0.0])
     plate = ContainerOcclusion(box((-1, 0.1, -1), (1, 0.2, 1)), down, hides=False)

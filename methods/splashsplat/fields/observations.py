@@ -33,7 +33,7 @@ from .rim import rim_of
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 7
+_REVISION = 8
 
 
 @dataclass(frozen=True)
