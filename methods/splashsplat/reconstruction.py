@@ -62,6 +62,8 @@ def fit_liquid(
         report(_TRACKING * fraction, message)
 
     observations = observe(scene, config.fields, run, report_tracking)
+    if observations.container is not None and not observations.container.hides:
+        config = config.seen_through()
     carriers, motion, packed = _track(observations, scene, config, run, report_tracking)
     carriers = store_precision(carriers, observations.grid)
     occlusion = observations.occlusion

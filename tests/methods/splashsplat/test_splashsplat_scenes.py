@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from splashbench.errors import SplashbenchError
@@ -154,6 +155,21 @@ def test_without_gravity_the_best_preset_leaves_out_what_needs_it(balls_copy: Pa
     # The usual shell: a deep one fills what the hull has too much, and twelve iterations make nothing transparent.
     fitted = fit(balls_copy, "best", shell_depth=4.0)
     assert_at_the_balls(fitted, balls_copy, median=0.005, near=0.75, iou=0.7)
+
+
+def test_the_shell_is_shallower_in_a_transparent_container(balls_copy: Path):
+    cut(balls_copy, 2)
+    trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation((5, 0, 5)).export(balls_copy / "box.ply")
+    change(balls_copy, container_mesh="box.ply", gravity=None)
+
+    def liquid(transparent: bool, **settings: object) -> int:
+        change(balls_copy, container_transparent=transparent)
+        return sum(carriers(fit(balls_copy, iterations=0, **settings)))
+
+    opaque = liquid(False)
+    assert liquid(True, clear_shell_depth=1.0) < 0.9 * opaque
+    assert liquid(True, clear_shell_depth=50.0) == opaque
+    assert liquid(False, clear_shell_depth=1.0) == opaque
 
 
 def test_flip_without_gravity_says_what_is_missing(balls_copy: Path):
