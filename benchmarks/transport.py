@@ -186,6 +186,8 @@ def compare(
     """The figures of one scene: predictor -> validity, escape, seconds and their values per step; and the steps."""
     bar = Bar(f"{scene.name}, {scene.n_frames} frames")
     observations = observe(scene, config.fields, Run(), bar.update)
+    if observations.in_transparent_container:
+        config = config.in_transparent_container()
     around = Surroundings(scene, observations, config, observations.grid, observations.ratio)
     values: dict[str, dict[str, list[float]]] = {name: {"validity": [], "escape": [], "seconds": []} for name in chosen}
     frames, carriers = [], []

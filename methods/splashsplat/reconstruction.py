@@ -62,8 +62,9 @@ def fit_liquid(
         report(_TRACKING * fraction, message)
 
     observations = observe(scene, config.fields, run, report_tracking)
-    if observations.container is not None and not observations.container.hides:
-        config = config.seen_through()
+    if observations.in_transparent_container:
+        config = config.in_transparent_container()
+        run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
     carriers, motion, packed = _track(observations, scene, config, run, report_tracking)
     carriers = store_precision(carriers, observations.grid)
     occlusion = observations.occlusion

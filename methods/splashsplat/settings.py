@@ -84,8 +84,8 @@ class SplashSplatConfig(MethodConfig):
     #: frames that a carrier lasts on average; None for as long as it stays in the liquid
     lifetime: PositiveInt | None = 4
     shell_depth: PositiveFloat = 12.0
-    #: the same in a transparent container, where it is less: views see the liquid's sides there, and its surface is not
-    #: deep in the hull
+    #: no more than this in a transparent container: views see the liquid's sides there, and its surface is not deep in
+    #: the hull; as much less far are carriers seen through liquid
     clear_shell_depth: PositiveFloat = 6.0
     #: how far beyond the surface carriers are born, too: coarse grids miss what is thinner than a voxel
     shell_outside: float = Field(0, ge=0, le=0.5)
@@ -270,7 +270,7 @@ class SplashSplatConfig(MethodConfig):
             self.control_cells if self.control_grid == "sides" else None,
         )
 
-    def seen_through(self) -> SplashSplatConfig:
+    def in_transparent_container(self) -> SplashSplatConfig:
         """The settings where the liquid is in a transparent container."""
         return self.model_copy(update={"shell_depth": min(self.shell_depth, self.clear_shell_depth)})
 

@@ -30,8 +30,8 @@ _FARTHEST_PIXELS = 4000.0
 # Voxels behind the mesh's surface where it begins to hide, for errors of the mesh and of its place.
 _TOLERANCE_VOXELS = 1.0
 # Voxels below the floor from which nothing is liquid: droplets that lie on it are thinner than a voxel, and cut at the
-# floor itself they would fall between the nodes. Beneath a transparent container the liquid in it would seem to reach
-# as deep; beneath others no view sees anything.
+# floor itself they would fall between the nodes. Liquid in the container may then seem to reach up to a voxel below its
+# foot, too. Views would see that through a transparent one, and not through others.
 _FLOOR_VOXELS = 1.0
 
 
@@ -63,8 +63,8 @@ class ContainerOcclusion:
         return cls(mesh, scene.gravity, hides=not scene.container_transparent)
 
     def with_mesh(self, mesh: ContainerMesh) -> ContainerOcclusion:
-        """The same container with its walls in another place: what it stands on is not lifted with them, and droplets
-        that lie there are not forbidden."""
+        """The same container with its walls in another place, scene units. What it stands on is not lifted with them,
+        so that droplets that lie there are not forbidden; walls that are lowered take it along."""
         moved = replace(self, mesh=mesh)
         if self.floor is None or moved.floor is None:
             return moved
@@ -73,7 +73,9 @@ class ContainerOcclusion:
     @property
     def floor(self) -> float | None:
         """Position along gravity (scene units) of what liquid cannot fall through; None where gravity is not known."""
-        if self.gravity is None or self.foot is not None:
+        if self.gravity is None:
+            return None
+        if self.foot is not None:
             return self.foot
         return float((self.mesh.vertices @ self.gravity).max())
 
@@ -168,8 +170,8 @@ class CarvingOcclusion:
     """A `ContainerOcclusion` made ready for the views of `silhouettes` on `grid`.
 
     Attributes:
-        outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say: in walls, below the
-            container's foot, and where fewer views than `witnesses` see anything.
+        outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say: where it is
+            `ContainerOcclusion.forbidden`, and where fewer views than `witnesses` see anything.
         views: what it hides from each view; empty for a container that hides nothing.
     """
 

@@ -83,6 +83,11 @@ class Observations:
         return self.silhouettes.n_frames
 
     @property
+    def in_transparent_container(self) -> bool:
+        """Whether the liquid is in a container that is known, and seen through."""
+        return self.container is not None and not self.container.hides
+
+    @property
     def ratio(self) -> float:
         """Hull voxels per transport voxel."""
         return self.grid.voxel / self.hull_grid.voxel

@@ -292,7 +292,7 @@ def test_the_paper_preset_is_the_papers():
     assert (paper.base_scale, paper.decoder.offset_bound, paper.decoder.opacity_band) == (0.35, 1.0, 3.0)
     assert paper.decoder.opacity_bias == 1.0
     best = SplashSplatConfig()
-    assert (best.carriers.shell.depth, best.seen_through().carriers.shell.depth) == (12.0, 6.0)
-    assert paper.seen_through() == paper
+    assert (best.carriers.shell.depth, best.in_transparent_container().carriers.shell.depth) == (12.0, 6.0)
+    assert paper.in_transparent_container() == paper
     assert (best.base_scale, best.decoder.offset_bound, best.decoder.opacity_band) == (0.5, 3.0, 20.0)
     assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
@@ -12,18 +13,21 @@ import torch
 import trimesh
 
 from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Run
 from splashbench.observe.container import depth_image
 from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
-from splashbench.scene.scene import TrainingScene
+from splashbench.scene.scene import Scene, TrainingScene
 from splashbench_methods.splashsplat.appearance.decoder import Children
 from splashbench_methods.splashsplat.appearance.fitting import composite
+from splashbench_methods.splashsplat.fields import observations
 from splashbench_methods.splashsplat.fields.container import ContainerSource, KnownContainer
 from splashbench_methods.splashsplat.fields.near_wall import NearWall, near_wall, room_beside
 from splashbench_methods.splashsplat.fields.occlusion import LiquidOcclusion
 from splashbench_methods.splashsplat.fields.rim import Rim, rim_of
 from splashbench_methods.splashsplat.fields.vessel import Vessel
+from splashbench_methods.splashsplat.settings import SplashSplatConfig
 
 UP = np.array([0.0, 1.0, 0.0])
 LEVEL, TOLERANCE = 0.06, 0.002
@@ -142,6 +146,25 @@ def test_a_container_that_is_too_high_or_too_low_is_moved_to_where_masks_end(lif
         camera = camera_at("new", angle)
         true, before, after = (wall_of(camera, mesh).share for mesh in (bowl(), bowl(lift), found.mesh))
         assert np.abs(after - true).sum() < 0.3 * np.abs(before - true).sum()
+
+
+def test_a_rim_that_is_lifted_leaves_the_floor_where_it_is(balls_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation((5, 0, 5)).export(balls_copy / "box.ply")
+    path = balls_copy / "scene.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"container_mesh": "box.ply"}))
+    scene = Scene.open(balls_copy).training()
+    settings = SplashSplatConfig.preset("quick", {"hull_cells": 32, "transport_cells": 16, "control_cells": 4}).fields
+
+    def lifted(known: KnownContainer, *_: object) -> Rim:
+        assert known.occlusion is not None
+        return Rim(ContainerMesh(known.occlusion.mesh.vertices + 0.02 * UP, known.occlusion.mesh.faces), None, None, "")
+
+    monkeypatch.setattr(observations, "rim_of", lifted)
+    assert scene.gravity is not None
+    container = observations.observe(scene, settings, Run(), lambda done, message: None).container
+    assert container is not None
+    assert container.floor == pytest.approx(0.05)
+    assert container.mesh.vertices[:, 1].min() == pytest.approx(-0.03)
 
 
 def test_without_masks_that_end_there_a_mesh_is_taken_at_its_word_and_a_guess_is_not() -> None:
