@@ -167,20 +167,22 @@ def budgets() -> Figure:
 
 
 def interpolation() -> Figure:
-    loss, table = by_scene("interpolation", "psnr_loss"), study("interpolation")
-    names = [name for name in METHODS if (name, "opaque_bowl") in loss]
-    figure = Figure(figsize=(9.2, 2.4), layout="constrained")
-    first, second = figure.subplots(1, 2, sharey=True)
-    first.plot([float(table[name, "psnr"]["mean"]) for name in names], range(len(names)), "o", color=BLUE)
-    faded = {y: table[f"{name}, faded", "psnr"] for y, name in enumerate(names) if (f"{name}, faded", "psnr") in table}
-    first.plot([float(row["mean"]) for row in faded.values()], list(faded), "|", color=GREY, ms=9, mew=1.5)
-    first.set_title("PSNR at unseen timesteps, dB →")
-    if faded:
-        figure.supxlabel("Upright bars: faded, the method's own renders of the neighbours, averaged.", fontsize=7.5)
-    named_rows(first, names)
-    scene_dots(second, loss, names)
-    second.set_title("← lost against a fit to all timesteps, dB")
-    legend(second)
+    rows = read(HERE / "data" / "withheld.csv")
+    figures = {(row["row"], row["scene"], row["metric"]): float(row["value"]) for row in rows}
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    names = list(dict.fromkeys(row["row"] for row in rows if not row["row"].endswith(", faded")))
+    figure = Figure(figsize=(9.2, 2.1), layout="constrained")
+    for place, scene in zip(figure.subplots(1, len(scenes), sharey=True), scenes):
+        for y, name in enumerate(names):
+            color = VERMILION if name == "splashsplat" else BLUE
+            place.plot(figures[name, scene, "psnr"], y, "o", color=color)
+            place.plot(figures[f"{name}, faded", scene, "psnr"], y, "|", color=GREY, ms=12, mew=1.5)
+        named_rows(place, names)
+        place.set_title(scene)
+    figure.supxlabel(
+        "PSNR at unseen timesteps, dB → Upright bars: faded, the method's own renders of the neighbours, averaged.",
+        fontsize=7.5,
+    )
     return figure
 
 

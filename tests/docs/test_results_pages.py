@@ -88,7 +88,22 @@ def test_told_nothing_is_what_was_measured() -> None:
             assert float(part.strip(" *†")) == pytest.approx(mean, abs=0.51 * 10**-digits)
 
 
-@pytest.mark.parametrize(("number", "kind"), [(1, "new poses"), (2, "240x160")])
+def test_the_first_page_has_the_means() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    table = [[cell.strip(" *†`") for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    start = next(n for n, row in enumerate(table) if row[0] == "method")
+    measured = told_nothing()
+    scenes = {scene for kind, scene, *_ in measured if kind == "240x160"}
+    names = []
+    for name, *cells in table[start + 2 : start + 7]:
+        names.append(name)
+        for cell, metric, digits in zip(cells, TOLD_NOTHING, (2, 4, 3, 3, 4), strict=True):
+            mean = sum(measured["240x160", scene, name, metric] for scene in scenes) / len(scenes)
+            assert float(cell) == pytest.approx(mean, abs=0.51 * 10**-digits)
+    assert names == ["splashsplat", "scaffold_4d", "spacetime_gaussians", "deformable_3dgs", "hull_points"]
+
+
+@pytest.mark.parametrize(("number", "kind"), [(1, "600x400"), (2, "new poses"), (3, "240x160")])
 def test_told_nothing_elsewhere_is_what_was_measured(number: int, kind: str) -> None:
     measured, table = told_nothing(), tables("told_nothing.md")[number]
     names, lines = table[0][1:], [line for line in table[2:] if line[0] != "mean"]
@@ -102,6 +117,20 @@ def test_told_nothing_elsewhere_is_what_was_measured(number: int, kind: str) -> 
             for part, metric, digits in zip(cell.split("/"), TOLD_NOTHING, (2, 4, 3, 3, 4), strict=True):
                 mean = sum(measured[kind, scene, name, metric] for scene, *_ in lines) / len(lines)
                 assert float(part.strip(" *†")) == pytest.approx(mean, abs=0.51 * 10**-digits)
+
+
+def test_what_was_withheld_is_what_was_measured() -> None:
+    with (RESULTS / "data" / "withheld.csv").open(encoding="utf-8", newline="") as file:
+        measured = {(row["scene"], row["row"], row["metric"]): float(row["value"]) for row in csv.DictReader(file)}
+    header, _, *lines = first_table("interpolation.md")
+    scenes = header[1:-1]
+    assert {(scene, name) for scene in scenes for name, *_ in lines} == {(scene, name) for scene, name, _ in measured}
+    for name, *cells in lines:
+        figures = [[float(part.strip(" *†")) for part in cell.split("/")] for cell in cells]
+        for n, metric in enumerate(TOLD_NOTHING):
+            values = [measured[scene, name, metric] for scene in scenes]
+            assert [of[n] for of in figures[:-1]] == pytest.approx(values, abs=1e-9)
+            assert figures[-1][n] == pytest.approx(sum(values) / len(values), abs=0.51 * 10.0 ** -(2, 4, 3, 3, 4)[n])
 
 
 @pytest.mark.parametrize(
