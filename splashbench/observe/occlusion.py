@@ -65,7 +65,7 @@ class ContainerOcclusion:
     def with_mesh(self, mesh: ContainerMesh) -> ContainerOcclusion:
         """The same container with its walls in another place, scene units. What it stands on is not lifted with them,
         so that droplets that lie there are not forbidden; walls that are lowered take it along."""
-        moved = replace(self, mesh=mesh)
+        moved = replace(self, mesh=mesh, foot=None)
         if self.floor is None or moved.floor is None:
             return moved
         return replace(moved, foot=max(self.floor, moved.floor))

@@ -209,6 +209,7 @@ def test_walls_that_are_moved_leave_the_floor_to_droplets() -> None:
     lifted, lowered = (plate.with_mesh(box((-1, y, -1), (1, y + 0.1, 1))) for y in (0.15, 0.02))
     assert lifted.floor == pytest.approx(-0.1)
     assert lowered.floor == pytest.approx(-0.02)
+    assert lifted.with_mesh(lowered.mesh).floor == pytest.approx(-0.02)
     y = nodes(grid)[..., 1]
     for moved, low in ((lifted, 0.1), (lowered, 0.02)):
         assert (moved.forbidden(grid)[y < low - 1e-6] > 0).all()
