@@ -119,6 +119,20 @@ def test_told_nothing_elsewhere_is_what_was_measured(number: int, kind: str) -> 
                 assert float(part.strip(" *†")) == pytest.approx(mean, abs=0.51 * 10**-digits)
 
 
+def test_told_all_is_what_was_measured() -> None:
+    measured, table = told_nothing(), tables("told_nothing.md")[4]
+    scenes = table[0][1:-1]
+    assert set(scenes) == {scene for kind, scene, *_ in measured if kind == "told all"}
+    pairs = (("psnr", "miou"), ("psnr", "miou"), ("volume_iou", "motion_error"), ("volume_iou", "motion_error"))
+    for (label, *cells), metrics in zip(table[2:], pairs, strict=True):
+        row = "told all" if "told all" in label else "told nothing"
+        for n, metric in enumerate(metrics):
+            figures = [float(cell.split("/")[n]) for cell in cells]
+            values = [measured["told all", scene, row, metric] for scene in scenes]
+            assert figures[:-1] == pytest.approx(values, abs=1e-9)
+            assert figures[-1] == pytest.approx(sum(values) / len(values), abs=0.0051 if metric == "psnr" else 5.1e-4)
+
+
 def test_what_was_withheld_is_what_was_measured() -> None:
     with (RESULTS / "data" / "withheld.csv").open(encoding="utf-8", newline="") as file:
         measured = {(row["scene"], row["row"], row["metric"]): float(row["value"]) for row in csv.DictReader(file)}

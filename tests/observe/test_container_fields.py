@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from splashbench.errors import SplashbenchError
 from splashbench.observe import Bounds, ContainerOcclusion, Grid, Silhouettes, sequence_bounds, signed_distance_fields
 from splashbench.observe.container import depth_image, hidden, hidden_share, solid_distance
 from splashbench.observe.occlusion import CarvingOcclusion
@@ -217,6 +218,12 @@ def test_walls_that_are_moved_leave_the_floor_to_droplets() -> None:
     without = ContainerOcclusion(plate.mesh).with_mesh(box((-1, 0.15, -1), (1, 0.25, 1)))
     assert without.floor is None
     assert sequence_bounds(scene, lifted).low[1] == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_container_that_is_above_all_liquid_is_named() -> None:
+    above = ContainerOcclusion(box((-1, 2, -1), (1, 2.2, 1)), np.array([0.0, -1.0, 0.0]), hides=False)
+    with pytest.raises(SplashbenchError, match="that the container is at the liquid"):
+        sequence_bounds(BallBehindAWall(), above)
 
 
 def test_a_view_must_see_a_point_and_two_where_asked_for() -> None:
