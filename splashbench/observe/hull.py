@@ -124,9 +124,7 @@ def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerOcclus
         carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
         common = _inside(carve(silhouettes, grid, silhouettes.sequence_distance, carving), grid, tolerance=1.0)
         if common is None:
-            where = (
-                "" if container is None else ", and that the container is at the liquid (container_pose, gravity)"
-            )
+            where = "" if container is None else ", and that the container is at the liquid (container_pose, gravity)"
             raise SplashbenchError(
                 "the liquid masks of the training views have no common visual hull; "
                 f"check the camera poses, and that masks and cameras belong together{where}"
