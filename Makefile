@@ -13,7 +13,7 @@ SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo quick-test test test-all lint docs pictures wheel kernel sanitize clean
+.PHONY: help demo quick-test test test-all lint docs pictures leaderboard wheel kernel sanitize clean
 
 # The compiled kernels, and what builds them: where one of these changes, they are built and installed anew.
 KERNEL_FOLDERS := splashbench/native splashbench/*/kernel methods/*/kernel
@@ -27,6 +27,7 @@ help:
 	@echo "make lint        check style, types, and which part imports which"
 	@echo "make docs        build the documentation site into site/; open site/index.html"
 	@echo "make pictures    draw the pictures of README.md and of the site anew; fits two methods first, which takes long"
+	@echo "make leaderboard  make the page of the project's own results anew, and say which figures changed"
 	@echo "make wheel       build the wheel into dist/"
 	@echo "make kernel      build the compiled kernels in place, after an edit"
 	@echo "make sanitize    run the kernels' tests under AddressSanitizer and UndefinedBehaviorSanitizer (needs g++)"
@@ -74,6 +75,10 @@ docs: .venv/installed-docs
 pictures: .venv/installed-synth
 	@echo "==> Drawing the pictures; scenes and fits go into build/pictures"
 	$(BIN)/python docs/tools/pictures.py
+
+leaderboard: .venv/ready
+	@echo "==> Making the page of the project's own results"
+	$(BIN)/splashbench leaderboard leaderboards/told_nothing/results leaderboards/told_nothing
 
 wheel: .venv/ready
 	@echo "==> Building the wheel"

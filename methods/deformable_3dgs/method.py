@@ -77,6 +77,11 @@ class Deformable3DGS(Method):
                 model.active_degree = min(config.sh_degree, step // config.sh_every)
                 return noise.at(step, photographs.left)
 
+            def after_step() -> None:
+                # What is loaded deforms; before the warm-up's end the network has nothing to say.
+                if model.deforms:
+                    run.checkpoint(lambda: MixedFitted(model, scene))
+
             with run.stage("fit"):
                 history = fit_dynamic(
                     model,
@@ -85,6 +90,7 @@ class Deformable3DGS(Method):
                     photographs,
                     lambda done: run.progress(done, f"fitting {len(model.positions)} Gaussians"),
                     begin_step,
+                    after_step,
                 )
         model.deforms, model.active_degree = True, config.sh_degree
         return MixedFitted(model, scene, history)

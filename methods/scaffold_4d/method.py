@@ -65,6 +65,7 @@ class Scaffold4D(Method):
                     SpacetimeGrowth(optimizer, voxel, frame, config, rng),
                     Photographs(scene, config.longest_side, config.views_per_step, rng),
                     lambda done: run.progress(done, f"fitting {len(model)} anchors"),
+                    after_step=lambda: run.checkpoint(lambda: MixedFitted(model, scene)),
                 )
         return MixedFitted(model, scene, history)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -87,12 +88,17 @@ class Background:
 
 
 def fit_background(
-    scene: TrainingScene, settings: BackgroundSettings, run: Run, span: tuple[float, float] = (0.0, 1.0)
+    scene: TrainingScene,
+    settings: BackgroundSettings,
+    run: Run,
+    span: tuple[float, float] = (0.0, 1.0),
+    offer: Callable[[Callable[[], Background]], None] | None = None,
 ) -> Background:
     """Fit the static scene behind the liquid to the training views' plates. The same seed gives the same background.
 
-    `span` is the part of `run`'s progress that this takes up, for callers with more to do. Raises SplashbenchError
-    where masks leave nothing to fit, or the anchors are to start from points and there are none, nor a hull.
+    `span` is the part of `run`'s progress that this takes up, for callers with more to do. `offer` is given, after
+    every step, what makes the background as if the fit ended there. Raises SplashbenchError where masks leave nothing
+    to fit, or the anchors are to start from points and there are none, nor a hull.
     """
     fitting = "background"
 
@@ -118,10 +124,15 @@ def fit_background(
     far_color = np.median(np.concatenate([plate.image[plate.seen] for plate in plates]), axis=0) / 255
     progress(0.05, "depths of the background")
     seed = _seed(points, [plate.without_beside() for plate in plates], settings, run.seed)
+
+    def offered(model: AnchorModel) -> None:
+        if offer is not None:
+            offer(lambda: Background(supervised_anchors(model, plates), far_color))
+
     with one_torch_thread():
         model = fit_model(
             seed, plates, settings, far_color.astype(np.float32), run.seed,
-            lambda fraction: progress(0.1 + 0.9 * fraction, fitting),
+            lambda fraction: progress(0.1 + 0.9 * fraction, fitting), offered,
         )  # fmt: skip
         return Background(supervised_anchors(model, plates), far_color)
 

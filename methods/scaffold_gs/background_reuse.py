@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from splashbench.harness.contract import Run
 from splashbench.scene import TrainingScene
 
@@ -13,14 +15,18 @@ VERSION = 3
 
 
 def shared_background(
-    scene: TrainingScene, settings: BackgroundSettings, run: Run, span: tuple[float, float] = (0.0, 1.0)
+    scene: TrainingScene,
+    settings: BackgroundSettings,
+    run: Run,
+    span: tuple[float, float] = (0.0, 1.0),
+    offer: Callable[[Callable[[], Background]], None] | None = None,
 ) -> Background:
     """What `fit_background` gives, or gave an earlier run of the same study (`Run.reuse`); the same renders."""
     return run.reuse(
         "background",
         scene,
         {"settings": settings.model_dump(mode="json"), "version": VERSION},
-        lambda: fit_background(scene, settings, run, span),
+        lambda: fit_background(scene, settings, run, span, offer),
         Background.save,
         Background.load,
     )

@@ -80,8 +80,11 @@ def fit_model(
     far_color: NDArray[np.float32],
     random_seed: int,
     progress: Callable[[float], None],
+    after_step: Callable[[AnchorModel], None] = lambda model: None,
 ) -> AnchorModel:
     """Optimise a model that starts at `seed`; `progress` hears the fraction done. `plates` show something each.
+
+    after_step: hears the model as it is after every step.
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -128,6 +131,7 @@ def fit_model(
                     growth.round()
             if iteration % 10 == 0:
                 progress(iteration / settings.iterations)
+            after_step(model)
     return model
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -39,7 +40,10 @@ class ScaffoldGS(Method):
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
 
     def fit(self, scene: TrainingScene, config: BackgroundSettings, run: Run) -> Fitted:
-        return StaticScene(shared_background(scene, config, run))
+        def offer(state: Callable[[], Background]) -> None:
+            run.checkpoint(lambda: StaticScene(state()))
+
+        return StaticScene(shared_background(scene, config, run, offer=offer))
 
     def load(self, directory: Path, scene: TrainingScene) -> Fitted:
         return StaticScene(Background.load(directory / "static"))

@@ -75,6 +75,7 @@ class SpacetimeGaussians(Method):
                     GuidedDensity(density, model, photographs, config, rng),
                     photographs,
                     lambda done: run.progress(done, f"fitting {len(model.positions)} Gaussians"),
+                    after_step=lambda: run.checkpoint(lambda: MixedFitted(model, scene)),
                 )
         return MixedFitted(model, scene, history)
 

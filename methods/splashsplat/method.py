@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -24,7 +25,7 @@ from .carriers.subframe import CarrierState
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import metric_gravity
 from .model import Liquid
-from .reconstruction import fit_liquid
+from .reconstruction import Reconstruction, fit_liquid
 from .settings import VERSION, SplashSplatConfig
 
 if TYPE_CHECKING:
@@ -159,8 +160,14 @@ class SplashSplat(Method):
             behind = {
                 name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()
             }
-        liquid, occlusion = fit_liquid(scene, behind, config, run, span=(_BACKGROUND, 1), frozen=frozen)
-        return FittedSplashSplat(liquid, background, occlusion)
+
+        def offer(state: Callable[[], Reconstruction]) -> None:
+            run.checkpoint(lambda: fitted(*state()))
+
+        def fitted(liquid: Liquid, occlusion: LiquidOcclusion | None) -> FittedSplashSplat:
+            return FittedSplashSplat(liquid, background, occlusion)
+
+        return fitted(*fit_liquid(scene, behind, config, run, span=(_BACKGROUND, 1), frozen=frozen, offer=offer))
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""

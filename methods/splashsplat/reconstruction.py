@@ -17,6 +17,7 @@ from splashbench.observe.container import solid_distance
 from splashbench.render import Frozen
 from splashbench.scene.scene import TrainingScene
 
+from .appearance.coarse import with_half_size
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
 from .appearance.targets import collect_targets
 from .carriers.coverage import uncovered_by_any
@@ -34,6 +35,8 @@ from .motion.velocity import control_shape
 from .settings import SplashSplatConfig
 
 Report = Callable[[float, str], None]
+#: The liquid, and what hides it from cameras.
+Reconstruction = tuple[Liquid, LiquidOcclusion | None]
 
 # Share of the time that everything before the appearance takes, for the progress bar only.
 _TRACKING = 0.25
@@ -48,11 +51,13 @@ def fit_liquid(
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
     frozen: Mapping[str, Frozen] | None = None,
-) -> tuple[Liquid, LiquidOcclusion | None]:
+    offer: Callable[[Callable[[], Reconstruction]], None] | None = None,
+) -> Reconstruction:
     """Reconstruct the liquid of `scene`; and what hides it from cameras.
 
     backgrounds: float32 [H, W, 3] of every training view, in [0, 1]; or [3] where `frozen` has the background's
     Gaussians of every view, to be drawn together with the liquid's. span: the part of `run`'s progress this takes up.
+    offer: is given, after every iteration of the appearance, what makes the reconstruction as if the fit ended there.
     """
 
     def report(fraction: float, message: str) -> None:
@@ -70,6 +75,29 @@ def fit_liquid(
     occlusion = observations.occlusion
     if occlusion is not None and frozen is not None:
         occlusion = occlusion.uncut()  # the background's Gaussians hide what is behind them themselves
+    # What moves the carriers of the other variants is not u_t.
+    carried = config.variant in ("full", "no_resampling")
+    composition = config.composition if frozen is not None else "over"
+
+    def reconstruction(appearance: Appearance, left: np.ndarray) -> Reconstruction:
+        kept, look = _pruned(carriers, appearance, left & visible_carriers(appearance, config.prune_opacity))
+        liquid = Liquid.of(
+            scene.times,
+            observations.grid,
+            kept,
+            motion,
+            packed,
+            look,
+            carried,
+            composition,
+            config.between_frames,
+        )
+        return liquid, occlusion
+
+    def offer_state(state: Callable[[], tuple[Appearance, np.ndarray]]) -> None:
+        if offer is not None:
+            offer(lambda: reconstruction(*state()))
+
     with run.stage("appearance"), one_torch_thread():
         track = Track(observations.grid, carriers, motion, packed)
         appearance, left = _fit_appearance(
@@ -82,23 +110,9 @@ def fit_liquid(
             config,
             run.seed,
             lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
+            offer_state,
         )
-        carriers, appearance = _pruned(carriers, appearance, left & visible_carriers(appearance, config.prune_opacity))
-    # What moves the carriers of the other variants is not u_t.
-    carried = config.variant in ("full", "no_resampling")
-    composition = config.composition if frozen is not None else "over"
-    liquid = Liquid.of(
-        scene.times,
-        observations.grid,
-        carriers,
-        motion,
-        packed,
-        appearance,
-        carried,
-        composition,
-        config.between_frames,
-    )
-    return liquid, occlusion
+        return reconstruction(appearance, left)
 
 
 def _track(
@@ -189,11 +203,15 @@ def _fit_appearance(
     config: SplashSplatConfig,
     seed: int,
     progress: Callable[[float], None],
+    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]]], None],
 ) -> tuple[Appearance, np.ndarray]:
     """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; and which of them
     were fitted to the end, bool [count]."""
     voxel = observations.grid.voxel
     appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
+    # Gaussians of the background that are drawn together with the liquid's are prepared for one size.
+    longest = max(max(camera.width, camera.height) for camera in scene.cameras.values())
+    coarse = frozen is None and config.coarse_share > 0 and longest > config.coarse_side
     targets = collect_targets(
         scene,
         backgrounds,
@@ -204,11 +222,18 @@ def _fit_appearance(
         hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
         cut=None if occlusion is None else lambda name, points: occlusion.cut(scene.cameras[name], points),
         frozen=frozen,
+        even=coarse,
     )
+    if coarse:
+        nowhere = np.zeros((0, 3))
+        cuts = {
+            name: None if occlusion is None else occlusion.cut(scene.cameras[name], nowhere) for name in scene.train
+        }
+        with_half_size(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
     color_cell = observations.hull_grid.voxel / voxel
-    fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress)
+    fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer)
     return appearance, fit.left
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "10"
+VERSION = "11"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -146,6 +146,10 @@ class SplashSplatConfig(MethodConfig):
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
     idle_share: float = Field(0.02, ge=0, le=0.2)
+    #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
+    coarse_share: float = Field(0.6, ge=0, le=1)
+    #: pixels along the longest side beyond which photographs are large enough for that
+    coarse_side: PositiveInt = 1000
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
 
@@ -206,6 +210,7 @@ class SplashSplatConfig(MethodConfig):
             "validation_share": 0.0,
             "prune_opacity": 0.0,
             "idle_share": 0.0,
+            "coarse_share": 0.0,
             "background_preset": "paper",
         },
         "quick": {
@@ -321,6 +326,7 @@ class SplashSplatConfig(MethodConfig):
             base_scale=self.base_scale,
             prune_opacity=self.prune_opacity,
             idle_share=self.idle_share,
+            coarse_share=self.coarse_share,
             weights=LossWeights(
                 foreground=self.foreground_weight,
                 gradient=self.gradient_weight,

@@ -18,10 +18,12 @@ _EPILOG = """\
 examples:
   splashbench run splashsplat scenes/bowl_001 submissions/bowl_001/splashsplat
   splashbench run splashsplat SCENE OUT --preset quick --seed 1 --set iterations=500
+  splashbench run splashsplat SCENE OUT --checkpoints   with its quality over time, for `score` and `leaderboard`
   splashbench run nothing SCENE OUT                 the frozen background alone, the reference for dPSNR
   splashbench run oracle SCENE OUT                  the ground truth itself, a check of the scoring
   splashbench run my_method.py:MyMethod SCENE OUT   a method that is not installed (CONTRIBUTING.md)
 
+With --checkpoints the fit's time leaves out what saving them takes, while --timeout and the memory include it.
 A method that crashes, hangs, runs out of memory or returns NaN gives a submission with that status, and exit status 1.
 A method is a program with your rights: run a stranger's in a container. A code in an environment of its own, such as
 an official implementation, runs by `splashbench run-external`.
@@ -48,11 +50,17 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         choices=["odd"],
         help="keep every second timestep from the method; these are rendered, and they alone are scored",
     )
+    parser.add_argument(
+        "--checkpoints",
+        action="store_true",
+        help="also keep the views of the fit on its way, after about 5, 10, 20, 40 ... seconds of it",
+    )
     add_run_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench run`."""
+    from splashbench.harness.checkpoints import MARKS
     from splashbench.harness.runner import TIMING_FRAMES, parse_overrides, run_method
 
     if arguments.method == "external":
@@ -69,6 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         timing_frames=TIMING_FRAMES if arguments.timing_frames is None else arguments.timing_frames,
         exr=arguments.exr,
         withheld=arguments.withhold,
+        checkpoints=MARKS if arguments.checkpoints else None,
         keep_model=not arguments.no_model,
         replace=arguments.replace,
         oracle_geometry=_oracle_geometry,

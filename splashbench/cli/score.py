@@ -20,6 +20,7 @@ examples:
   splashbench score runs/bowl_001/splashsplat --scene scenes/bowl_001 --out results
   splashbench score runs/bowl_001/* --scene scenes/bowl_001 --out results --reference runs/bowl_001/nothing
 
+Beside each result lie its pictures (.jpg), which the leaderboard's page shows. A run with checkpoints has them scored.
 Ground truth comes from SCENE alone. A failed run becomes a result with its status and without scores. --reference
 takes the submission of the control `nothing` on the same scene and gives dpsnr_bg and spill_rgb. LPIPS needs weights,
 else it is null: --lpips-weights, the environment variable SPLASHBENCH_LPIPS_WEIGHTS, or an installed lpips package with
@@ -52,6 +53,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench score`."""
     from splashbench.files import require_file_place, require_folder_place
+    from splashbench.report.result_sheet import write_result_sheet
     from splashbench.scene import Scene
     from splashbench.score import score_submission, shared_fields
     from splashbench.submission import Submission
@@ -72,7 +74,10 @@ def run(arguments: argparse.Namespace) -> int:
             scene, submission, reference, arguments.lpips_weights, protocol=protocol, fields=fields
         )
         results.append(result)
-        files.append(str(result.save(arguments.out)))
+        saved = result.save(arguments.out)
+        files.append(str(saved))
+        if result.status == "ok":
+            write_result_sheet(scene, submission, saved)
     if arguments.sheet:
         from splashbench.report.contact_sheet import contact_sheet
 

@@ -62,10 +62,12 @@ def fit_dynamic(
     photographs: Photographs,
     progress: Callable[[float], None],
     begin_step: Callable[[int], float] = lambda step: 0.0,
+    after_step: Callable[[], None] = lambda: None,
 ) -> FitHistory:
     """Fit `model` in place, over the optimizer's iterations.
 
     begin_step: called before every step; what it returns is added to the step's times, such as noise.
+    after_step: called after every step, to offer the model as it is (`Run.checkpoint`).
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -111,4 +113,5 @@ def fit_dynamic(
         psnr[step] = -10 * math.log10(max(float(np.mean(errors)), 1e-10))
         if step % 10 == 0:
             progress(step / optimizer.iterations)
+        after_step()
     return FitHistory(psnr)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from splashbench.errors import SplashbenchError
+from splashbench.harness.checkpoints import Checkpoints
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
 
 T = TypeVar("T")
@@ -72,7 +73,7 @@ class Run:
     _overhead_seconds: float = 0.0
     _digests: dict[Path, str] = field(default_factory=dict)
     _report: Callable[[float, str], None] | None = None
-    _checkpoint: Callable[[Fitted], None] | None = None
+    _checkpoints: Checkpoints | None = None
 
     def progress(self, fraction: float, message: str = "") -> None:
         """Tell the user how far the fit is: `fraction` in [0, 1], and what is being done."""
@@ -81,21 +82,33 @@ class Run:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the wall time of what is within as the stage `name`, for record.json; stages may come back."""
-        start = time.perf_counter()
+        """Count the wall time of what is within as the stage `name`, for record.json; stages may come back.
+
+        What checkpoints take is left out.
+        """
+        start, before = time.perf_counter(), self._checkpoint_seconds()
         try:
             yield
         finally:
-            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+            seconds = time.perf_counter() - start - (self._checkpoint_seconds() - before)
+            self.stages[name] = self.stages.get(name, 0.0) + seconds
+
+    def _checkpoint_seconds(self) -> float:
+        return 0.0 if self._checkpoints is None else self._checkpoints.spent
 
     def note(self, name: str, text: str) -> None:
         """Write into record.json what the method found out by itself and went by, in a few words."""
         self.notes[name] = text
 
-    def checkpoint(self, fitted: Fitted) -> None:
-        """Offer an intermediate state; where the harness collects them it saves it outside the clock."""
-        if self._checkpoint is not None:
-            self._checkpoint(fitted)
+    def checkpoint(self, state: Callable[[], Fitted]) -> None:
+        """Offer the state of the fit, as if it ended here: at every step, or as often as there is something to show.
+
+        Args:
+            state: makes a model that can be saved. It is called at a few offers only, outside the clock, and must not
+                change the fit: with or without checkpoints the same model has to come out.
+        """
+        if self._checkpoints is not None:
+            self._overhead_seconds += self._checkpoints.offer(state)
 
     def reuse(
         self,

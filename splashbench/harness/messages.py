@@ -15,6 +15,8 @@ class Request(BaseModel):
     Attributes:
         phase: fit (scene -> model), import (an external code's output -> model), render (model -> test views).
         times: of the views to render, seconds by test camera; by default those of the scene's timesteps.
+        only_views: render nothing but the views, and hand in no particles.
+        checkpoints: folder for states of the fit under way; null takes none. marks: when, see checkpoints.py.
         importer: imports and renders a model instead of the method. source, export: what it reads it from.
     """
 
@@ -36,6 +38,9 @@ class Request(BaseModel):
     exr: bool
     cache: str | None = None
     times: dict[str, list[float]] | None = None
+    only_views: bool = False
+    checkpoints: str | None = None
+    marks: list[float] = []
     importer: str | None = None
     source: str = ""
     export: str = ""
@@ -50,7 +55,10 @@ class Failure(Exception):
 
 
 class Outcome(BaseModel):
-    """How a phase ended, as the harness's own code in the child process saw it."""
+    """How a phase ended, as the harness's own code in the child process saw it.
+
+    checkpoints: seconds of the fit at each state that was saved; checkpoint_seconds: what saving them all took.
+    """
 
     model_config = ConfigDict(extra="forbid")
     status: Status = Status.OK
@@ -59,6 +67,8 @@ class Outcome(BaseModel):
     reused: dict[str, float] = {}
     stages: dict[str, float] = {}
     notes: dict[str, str] = {}
+    checkpoints: list[float] = []
+    checkpoint_seconds: float | None = None
     render_fps: float | None = None
     timed_frames: int | None = None
     primitives_per_frame: float | None = None

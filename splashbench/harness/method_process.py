@@ -15,6 +15,7 @@ from typing import Any, TextIO
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import raise_if_disk_full, read_model, write_model
+from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Method, Run
 from splashbench.harness.discovery import load_method
 from splashbench.harness.external.importers import Importer, load_importer
@@ -76,12 +77,22 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
             _report=_reporter(stream),
         )
         start = time.perf_counter()
+        if request.checkpoints:
+            run._checkpoints = Checkpoints(
+                Path(request.checkpoints),
+                request.marks,
+                lambda: run.fit_seconds(time.perf_counter() - start),
+                _synchronise,
+            )
         fitted = method.fit(scene, config, run)
         _synchronise()
         seconds = run.fit_seconds(time.perf_counter() - start)
     fitted.save(Path(request.model))
+    taken = run._checkpoints
     return Outcome(
         seconds=seconds,
+        checkpoints=taken.seconds if taken else [],
+        checkpoint_seconds=taken.spent if taken else None,
         reused=run.reused,
         stages=run.stages,
         notes=run.notes,
@@ -123,11 +134,12 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
                 write_exr(output / "exr" / camera.name / f"{t:06d}.exr", render.rgb, render.alpha)
             report((i + 1) / len(views), "rendering the test views")
     # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
-    particles = fitted.particles() if request.times is None else None
+    bare = request.only_views or request.times is not None
+    particles = None if bare else fitted.particles()
     if particles is not None:
         check_particles(particles, scene.n_frames)
         particles.save(output / "particles.npz")
-    geometry = fitted.signed_distance() if request.times is None else None
+    geometry = None if bare else fitted.signed_distance()
     if geometry is not None:
         check_geometry(geometry, scene.n_frames)
         geometry.save(output / "geometry.npz")

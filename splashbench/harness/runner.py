@@ -7,7 +7,7 @@ complete in every case: with renders when the run is `ok`, else with a status an
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from splashbench.harness.messages import Outcome, Request
 from splashbench.harness.training_copy import make_training_copy
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene, SignedDistance
-from splashbench.submission import IDENTITY, Identity, Record, Status, Submission, identity_text, seal
+from splashbench.submission import IDENTITY, Checkpoint, Identity, Record, Status, Submission, identity_text, seal
 from splashbench.submission.withheld import Withheld, kept_timesteps
 from splashbench.version import __version__
 
@@ -47,6 +47,7 @@ def run_method(
     exr: bool = False,
     cache: Path | None = None,
     withheld: Withheld | None = None,
+    checkpoints: Sequence[float] | None = None,
     oracle_geometry: Callable[[Scene], SignedDistance | None] | None = None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
@@ -60,6 +61,8 @@ def run_method(
         exr: write the renders also as OpenEXR, for compositing (submission/exr.py).
         cache: a folder for what the runs of one study share (reuse.py); the record says what came from there.
         withheld: timesteps that the method does not see; they are rendered and scored (submission/withheld.py).
+        checkpoints: seconds of the fit after which its state is taken, and the test views rendered by it, such as
+            `checkpoints.MARKS`.
         oracle_geometry: for the control `oracle` alone, see `write_oracle`.
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
@@ -72,8 +75,8 @@ def run_method(
             "`external` is run by commands: splashbench run-external SCENE OUT --name ... --command ..."
         )
     if name == ORACLE:
-        if preset or overrides or withheld:
-            raise SplashbenchError("the oracle is the truth itself, without presets or settings; leave them out")
+        if preset or overrides or withheld or checkpoints:
+            raise SplashbenchError("the oracle is the truth itself: it has no presets, settings or fit; leave them out")
         from splashbench.harness.oracle import write_oracle
 
         return write_oracle(scene, out, geometry=oracle_geometry, replace=replace)
@@ -87,6 +90,7 @@ def run_method(
         method,
         preset=preset,
         settings=without_nulls(config.model_dump(mode="json")),
+        overrides=override_texts(overrides or {}),
         seed=seed,
         device=device,
         scene=scene.name,
@@ -118,6 +122,8 @@ def run_method(
                 exr=exr,
                 cache=str(cache.resolve()) if cache else None,
                 times={name: scene.camera_times[name].tolist() for name in scene.test} if withheld else None,
+                checkpoints=str(_folder(Path(scratch, "checkpoints"))) if checkpoints else None,
+                marks=list(checkpoints or ()),
             ),
         )
         drop_unwanted(staging, record.status, keep_model)
@@ -165,6 +171,7 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     record = Record()
     peak = 0
     device_peak: int | None = None
+    seconds: list[float] = []
     for phase in ("fit", "render"):
         label = f"{request.method.rpartition('/')[2][:24]}: {phase}"
         outcome, watched = run_phase(scratch, request.model_copy(update={"phase": phase}), label)
@@ -188,17 +195,43 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
                     "reused": outcome.reused,
                     "stages": outcome.stages,
                     "notes": outcome.notes,
+                    "checkpoint_seconds": outcome.checkpoint_seconds,
                     "storage_bytes": storage,
                     "dynamic_bytes": storage - static,
                 }
             )
+            seconds = outcome.checkpoints
+    checkpoints = [_checkpoint(scratch, staging, request, k, of_fit) for k, of_fit in enumerate(seconds)]
     return record.model_copy(
         update={
+            "checkpoints": checkpoints,
             "render_fps": outcome.render_fps,
             "timed_frames": outcome.timed_frames,
             "primitives_per_frame": outcome.primitives_per_frame,
             "particles_per_frame": particles_per_frame(staging),
         }
+    )
+
+
+def _checkpoint(scratch: Path, staging: Path, request: Request, number: int, seconds: float) -> Checkpoint:
+    """Render the test views by the state that the fit had after `seconds`; its model is removed then."""
+    name = f"{number:02d}"
+    model, folder = Path(str(request.checkpoints), name), f"checkpoints/{name}"
+    label = f"{request.method.rpartition('/')[2][:24]}: after {seconds:.0f} s"
+    changes = {"phase": "render", "model": str(model), "output": str(_folder(staging / folder)), "timing_frames": 0}
+    outcome, _ = run_phase(scratch, request.model_copy(update={**changes, "exr": False, "only_views": True}), label)
+    storage = tree_bytes(model)
+    dynamic = storage - tree_bytes(model / "static")
+    _remove_tree(model)
+    if outcome.status != Status.OK:
+        _remove_tree(staging / folder)
+    return Checkpoint(
+        seconds=seconds,
+        folder=folder,
+        status=outcome.status,
+        reason=outcome.reason,
+        storage_bytes=storage,
+        dynamic_bytes=dynamic,
     )
 
 
@@ -254,7 +287,7 @@ def drop_unwanted(staging: Path, status: Status, keep_model: bool) -> None:
     if not keep_model or status != Status.OK:
         _remove_tree(staging / "model")
     if status != Status.OK:
-        for name in ("renders", "alpha", "exr"):
+        for name in ("renders", "alpha", "exr", "checkpoints"):
             _remove_tree(staging / name)
         for name in ("particles.npz", "geometry.npz"):
             (staging / name).unlink(missing_ok=True)
@@ -295,3 +328,16 @@ def parse_overrides(pairs: list[str]) -> dict[str, Any]:
                 raise SplashbenchError(f"--set {pair!r} sets a part of {parent}, to which another --set gives a value")
         node[leaf] = value
     return settings
+
+
+def override_texts(settings: Mapping[str, Any], parent: str = "") -> list[str]:
+    """What `parse_overrides` makes `settings` of: `{"losses": {"separation": 0}}` -> `["losses.separation=0"]`."""
+    import json
+
+    texts = []
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            texts += override_texts(value, f"{parent}{key}.")
+        else:
+            texts.append(f"{parent}{key}={value if isinstance(value, str) else json.dumps(value, default=str)}")
+    return texts

@@ -1,4 +1,4 @@
-"""Speed against accuracy: fit time against LPIPS and against PSNR over background (docs/protocol.md, "Charts").
+"""Speed against accuracy: fit time against LPIPS and against PSNR over background (docs/protocol.md).
 
 PNG and SVG; the bytes depend on the results alone. speed_accuracy.py computes what is drawn.
 """

@@ -37,7 +37,7 @@ def contact_sheet(scene: Scene, submissions: Sequence[Any], out_png: Path, times
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    chosen = list(times) if times is not None else _spread_times(scene)
+    chosen = list(times) if times is not None else spread_times(scene)
     columns = [(camera, t) for camera in scene.test for t in chosen]
     ratios = [1.0] + [ratio for s in submissions for ratio in ((1.0, 1.0) if _ok(s) else (0.25,))]
     aspect = float(np.mean([scene.cameras[name].height / scene.cameras[name].width for name in scene.test]))
@@ -73,7 +73,7 @@ def _ok(submission: Any) -> bool:
     return getattr(submission.status, "value", submission.status) == "ok"
 
 
-def _spread_times(scene: Scene) -> list[int]:
+def spread_times(scene: Scene) -> list[int]:
     """Early, middle and last of the frames in which the first test view sees liquid."""
     wet = [t for t in range(scene.n_frames) if scene.mask(scene.test[0], t).any()] or list(range(scene.n_frames))
     return sorted({wet[round(share * (len(wet) - 1))] for share in (0.2, 0.6, 1.0)})

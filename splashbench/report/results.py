@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from splashbench.errors import SplashbenchError
@@ -66,9 +67,14 @@ def _refuse_repeats(sources: list[ResultFile]) -> None:
 def _plausible(path: Path, result: Result) -> Result:
     """`result`. Raises SplashbenchError where a charted figure is out of range."""
     for name, least in _CHARTED.items():
-        value = result.value(name)
-        if value is not None and not least <= value <= _CHARTED_MAX:
-            raise SplashbenchError(f"{path}: metrics.{name} is {value:g}, which no run has; score the submission again")
+        values = [(f"metrics.{name}", result.value(name))]
+        values += [(f"checkpoints.{k}.{name}", c.metrics.get(name)) for k, c in enumerate(result.checkpoints)]
+        for where, value in values:
+            if value is not None and not least <= value <= _CHARTED_MAX:
+                raise SplashbenchError(f"{path}: {where} is {value:g}, which no run has; score the submission again")
+    seconds = [checkpoint.seconds for checkpoint in result.checkpoints]
+    if any(later < earlier for earlier, later in pairwise(seconds)) or max(seconds, default=0) > _CHARTED_MAX:
+        raise SplashbenchError(f"{path}: the seconds of its checkpoints do not rise; score the submission again")
     return result
 
 

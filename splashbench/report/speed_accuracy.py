@@ -1,6 +1,7 @@
 """What the speed-accuracy chart shows, as numbers: dots, means with intervals, Pareto front, controls, failures.
 
-docs/protocol.md, "Charts". One chart row per machine: a front that mixes hardware would compare machines, not methods.
+docs/protocol.md, "Quality over time". One chart row per group (groups.py): a front that mixes hardware would compare
+machines, not methods.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.report.groups import Group, groups
 from splashbench.report.results import ResultFile
 from splashbench.score.result import Result
 
@@ -114,38 +116,40 @@ def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) 
 
 
 def machines(sources: Sequence[ResultFile]) -> list[Machine]:
-    """The measured results by machine and protocol, in order of name.
+    """The measured results by machine, protocol and what the scenes told, in order of name.
 
-    Controls and failed runs are set apart; no run is dropped. Figures of two protocols never share a panel.
+    Controls and failed runs are set apart; no run is dropped. Figures of two groups never share a panel.
     """
-    by_machine: dict[tuple[str, str], list[Result]] = defaultdict(list)
-    for source in sources:
-        by_machine[source.result.hardware_label, source.result.protocol_label].append(source.result)
-    return [_machine(title, protocol, results) for (title, protocol), results in sorted(by_machine.items())]
+    return [_machine(group) for group in groups(sources)]
 
 
-def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
-    scenes = len({result.digests.scene for result in results})
-    machine = Machine(f"{title} · {scenes} scene{'' if scenes == 1 else 's'}, protocol {protocol}", scenes)
-    entries: dict[str, ChartedMethod] = {}
+def _machine(group: Group) -> Machine:
+    scenes = len(group.scenes)
+    told = "" if group.told is None else f", told {group.told_text}"
+    machine = Machine(
+        f"{group.machine} · {scenes} scene{'' if scenes == 1 else 's'}, protocol {group.protocol}{told}", scenes
+    )
+    for entry in group.entries:
+        charted = ChartedMethod(entry.label, entry.first.mixed)
+        for result in entry.results:
+            seconds = result.value("fit_seconds")
+            if result.status != "ok":
+                machine.failures[f"{result.method}: {result.status}"] += 1
+            elif not seconds or seconds <= 0:
+                machine.failures[f"{result.method}: fit time not measured"] += 1
+            else:
+                memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
+                charted.dots.append(Dot(seconds, _shown_values(result), memory))
+                charted.scenes.add(result.digests.scene)
+        if charted.dots:
+            machine.entries.append(charted)
     controls: dict[str, list[dict[str, float]]] = defaultdict(list)
-    names = _labels(results)
-    for result in results:
-        values = {name: value for name in _SHOWN if (value := result.value(name)) is not None}
-        seconds = result.value("fit_seconds")
-        if result.status != "ok":
-            machine.failures[f"{result.method}: {result.status}"] += 1
-        elif result.control:
-            controls[result.method].append(values)
-        elif not seconds or seconds <= 0:
-            machine.failures[f"{result.method}: fit time not measured"] += 1
-        else:
-            label = names[_key(result)]
-            memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
-            entry = entries.setdefault(label, ChartedMethod(label, result.mixed))
-            entry.dots.append(Dot(seconds, values, memory))
-            entry.scenes.add(result.digests.scene)
-    machine.entries = [entries[label] for label in sorted(entries)]
+    for entry in group.controls:
+        for result in entry.results:
+            if result.status == "ok":
+                controls[result.method].append(_shown_values(result))
+            else:
+                machine.failures[f"{result.method}: {result.status}"] += 1
     for method, runs in sorted(controls.items()):
         metrics = {name for run in runs for name in run}
         machine.controls[method] = {
@@ -154,20 +158,8 @@ def _machine(title: str, protocol: str, results: list[Result]) -> Machine:
     return machine
 
 
-def _key(result: Result) -> tuple[str, str, str]:
-    return (result.method, result.preset, result.settings_digest)
-
-
-def _labels(results: list[Result]) -> dict[tuple[str, str, str], str]:
-    """Method, with the preset where it has several, and the settings' digest where a preset has several."""
-    keys = {_key(result) for result in results}
-    labels = {}
-    for method, preset, digest in keys:
-        presets = {key[1] for key in keys if key[0] == method}
-        twins = {key for key in keys if key[:2] == (method, preset)}
-        label = method if len(presets) == 1 else f"{method} [{preset}]"
-        labels[method, preset, digest] = label if len(twins) == 1 else f"{label} {digest}"
-    return labels
+def _shown_values(result: Result) -> dict[str, float]:
+    return {name: value for name in _SHOWN if (value := result.value(name)) is not None}
 
 
 def reported_machine() -> Machine:

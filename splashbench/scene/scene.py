@@ -171,6 +171,21 @@ class Scene:
         return np.concatenate([data[:, :6], segment], axis=1).astype(np.float32)
 
     @property
+    def stated(self) -> tuple[str, ...]:
+        """What the scene tells a method besides images, masks of the liquid and cameras; in a fixed order."""
+        masks = [self.directory / "container_mask" / f"{name}.png" for name in self.train]
+        has = {
+            "times": self.times_source != "nominal",
+            "gravity": self.gravity is not None,
+            "metric scale": self.metres_per_unit is not None,
+            "container mesh": self.meta is not None and self.meta.container_mesh is not None,
+            "container masks": any(path.is_file() for path in masks),
+            "transparency": self.container_transparent is not None,
+            "sparse points": (self.directory / "init_pt_cld.npz").is_file(),
+        }
+        return tuple(name for name, known in has.items() if known)
+
+    @property
     def has_truth(self) -> bool:
         """Whether it is a synthetic scene whose true particles are known."""
         return bool(self._source.truth_files())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -17,12 +17,12 @@ from typing import Any
 from splashbench import progress
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
-from splashbench.score.image.lpips import load_lpips
+from splashbench.score.image.lpips import Lpips, load_lpips
 from splashbench.score.image.views import Track, score_views
 from splashbench.score.metrics import METRICS
 from splashbench.score.particles.physics import liquid_particles, score_particles
 from splashbench.score.particles.uniformity import DistanceFields
-from splashbench.score.result import Digests, MetricValue, Result, metric_value
+from splashbench.score.result import CheckpointScore, Digests, MetricValue, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1, Protocol
 from splashbench.score.truth.comparison import score_ground_truth
 from splashbench.version import __version__
@@ -61,10 +61,12 @@ def score_submission(
     status = _text(submission.status)
     metrics = _costs(submission.record)
     weights_digest = None
+    checkpoints: tuple[CheckpointScore, ...] = ()
     if status == _OK:
         lpips, no_lpips = load_lpips(lpips_weights)
         weights_digest = lpips.digest if lpips else None
         metrics |= score_views(scene, submission, reference, lpips, no_lpips, protocol, track)
+        checkpoints = _score_checkpoints(scene, submission, reference, lpips, no_lpips, protocol, track)
         fields = fields or shared_fields(scene, protocol)
         particles, no_particles = liquid_particles(scene, submission)
         metrics |= score_particles(scene, particles, no_particles, fields, protocol, track)
@@ -79,6 +81,8 @@ def score_submission(
         seed=identity.seed,
         preset=identity.preset,
         settings=identity.settings,
+        overrides=tuple(identity.overrides),
+        told=scene.stated,
         control=identity.control,
         mixed=identity.mixed,
         withheld=identity.withheld,
@@ -94,11 +98,49 @@ def score_submission(
             truth=scene.truth_digest,
         ),
         metrics={name: metrics[name] for name in METRICS},
+        checkpoints=checkpoints,
+        stages=dict(submission.record.stages),
+        notes=dict(submission.record.notes),
         claimed={name: value for name, value in identity.claimed.items() if math.isfinite(value)},
         hardware=identity.hardware,
         times_source=scene.times_source,
         versions=_versions(),
     )
+
+
+def _score_checkpoints(
+    scene: Scene,
+    submission: Any,
+    reference: Any | None,
+    lpips: Lpips | None,
+    no_lpips: str,
+    protocol: Protocol,
+    track: Track,
+) -> tuple[CheckpointScore, ...]:
+    """The image metrics of every state of the fit that was kept, in the order of time."""
+    record = submission.record
+    views = {checkpoint.folder: of for checkpoint, of in submission.checkpoints()} if record.checkpoints else {}
+    scores = []
+    for checkpoint in record.checkpoints:
+        figures: dict[str, float | None] = {}
+        if checkpoint.folder in views:
+            moment = f"after {checkpoint.seconds:.0f} s, "
+
+            def told(steps: Iterable[int], what: str, moment: str = moment) -> Iterator[int]:
+                return track(steps, moment + what)
+
+            found = score_views(scene, views[checkpoint.folder], reference, lpips, no_lpips, protocol, told)
+            figures = {name: value.value for name, value in found.items()}
+        scores.append(
+            CheckpointScore(
+                seconds=checkpoint.seconds,
+                status=_text(checkpoint.status),
+                reason=checkpoint.reason,
+                storage_bytes=checkpoint.storage_bytes,
+                metrics=figures,
+            )
+        )
+    return tuple(scores)
 
 
 def shared_fields(scene: Scene, protocol: Protocol = PROTOCOL_V1) -> Callable[[], DistanceFields]:

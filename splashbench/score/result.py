@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -51,6 +51,19 @@ class MetricValue(_Frozen):
     frames: tuple[float | None, ...] = ()
 
 
+class CheckpointScore(_Frozen):
+    """The image metrics of the fit on its way, `seconds` after its begin: means alone, null for what has none.
+
+    Where `status` is not ok there are no views to score, for `reason`.
+    """
+
+    seconds: float = Field(ge=0, allow_inf_nan=False)
+    status: str = "ok"
+    reason: str = ""
+    storage_bytes: int | None = Field(default=None, ge=0)
+    metrics: dict[str, Annotated[float, Field(allow_inf_nan=False)] | None] = Field(default_factory=dict)
+
+
 class Digests(_Frozen):
     """SHA-256 of everything a result depends on; null for what was not used. truth: of the scene's true particles."""
 
@@ -63,7 +76,14 @@ class Digests(_Frozen):
 
 
 class Result(_Frozen):
-    """The score of one submission. `metrics` has every name of the registry."""
+    """The score of one submission. `metrics` has every name of the registry.
+
+    Attributes:
+        overrides: KEY=VALUE, settings that were given on top of the preset.
+        told: what the scene states besides images, masks and cameras (`Scene.stated`); None where it was not noted.
+        checkpoints: the fit on its way, in the order of time.
+        stages, notes: of the submission's record: seconds of the fit's phases, and what the method found out.
+    """
 
     schema_version: Literal[1] = 1
     method: str
@@ -72,6 +92,8 @@ class Result(_Frozen):
     seed: int
     preset: str
     settings: dict[str, Any] = Field(default_factory=dict)
+    overrides: tuple[str, ...] = ()
+    told: tuple[str, ...] | None = None
     control: bool = False
     mixed: bool = False
     withheld: str | None = None
@@ -80,6 +102,9 @@ class Result(_Frozen):
     protocol: Protocol
     digests: Digests
     metrics: dict[str, MetricValue]
+    checkpoints: tuple[CheckpointScore, ...] = ()
+    stages: dict[str, float] = Field(default_factory=dict)
+    notes: dict[str, str] = Field(default_factory=dict)
     claimed: dict[str, float] = Field(default_factory=dict)
     hardware: dict[str, Any] = Field(default_factory=dict)
     times_source: str = ""

@@ -1,6 +1,14 @@
 """Submissions: what a method hands in. Writing, reading and checking them."""
 
-from splashbench.submission.identity import PROTOCOL, RENAMED_FIGURES, Identity, Record, Status, with_current_names
+from splashbench.submission.identity import (
+    PROTOCOL,
+    RENAMED_FIGURES,
+    Checkpoint,
+    Identity,
+    Record,
+    Status,
+    with_current_names,
+)
 from splashbench.submission.submission import (
     IDENTITY,
     Submission,
@@ -15,6 +23,7 @@ __all__ = [
     "IDENTITY",
     "PROTOCOL",
     "RENAMED_FIGURES",
+    "Checkpoint",
     "Identity",
     "Record",
     "Status",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -50,6 +51,8 @@ class Identity(BaseModel):
     method_version: str = "1"
     preset: str = "best"
     settings: dict[str, Any] = Field(default_factory=dict)
+    #: KEY=VALUE: settings that were given on top of the preset
+    overrides: list[Annotated[str, Field(max_length=_MAX_NOTE)]] = Field(default_factory=list, max_length=1000)
     seed: int = 0
     device: str = "cpu"
     scene: str
@@ -69,6 +72,21 @@ class Identity(BaseModel):
         return with_current_names(value)
 
 
+class Checkpoint(BaseModel):
+    """A state of the fit under way, taken when it had lasted `seconds`; its views lie in the folder `folder`.
+
+    Where `status` is not ok it has none, for `reason`. storage_bytes: of the model as it was then.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+    seconds: float = Field(ge=0, le=_MAX_COST)
+    folder: str = Field(pattern=r"^checkpoints/[0-9]{2}$")
+    status: Status = Status.OK
+    reason: str = ""
+    storage_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
+    dynamic_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
+
+
 class Record(BaseModel):
     """record.json: status and costs, as the harness measured them; null is not measured."""
 
@@ -81,6 +99,10 @@ class Record(BaseModel):
     reused: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
     #: seconds of the fit's stages, where the method tells them
     stages: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
+    #: states of the fit on its way, in the order of their seconds
+    checkpoints: list[Checkpoint] = Field(default_factory=list, max_length=100)
+    #: seconds that saving them took, which fit_seconds leaves out; null where none were asked for
+    checkpoint_seconds: float | None = Field(default=None, ge=0, le=_MAX_COST)
     #: what the method found out by itself and went by
     notes: dict[str, Annotated[str, Field(max_length=_MAX_NOTE)]] = Field(default_factory=dict, max_length=_MAX_NOTES)
     render_fps: float | None = Field(default=None, ge=0, le=_MAX_COST)
@@ -98,3 +120,12 @@ class Record(BaseModel):
     @classmethod
     def _current_names(cls, data: Any) -> Any:
         return with_current_names(data)
+
+    @field_validator("checkpoints")
+    @classmethod
+    def _in_order(cls, value: list[Checkpoint]) -> list[Checkpoint]:
+        if any(later.seconds < earlier.seconds for earlier, later in pairwise(value)):
+            raise ValueError("the seconds of checkpoints must not fall")
+        if len({checkpoint.folder for checkpoint in value}) < len(value):
+            raise ValueError("two checkpoints have one folder")
+        return value

@@ -6,6 +6,7 @@ renders/<cam>/<frame>.png   sRGB, test views       (status ok only)
 alpha/<cam>/<frame>.png     foreground opacity     (status ok only)
 particles.npz               positions [T, N, 3], active [T, N]; optional
 geometry.npz                the liquid's signed distance [T, nx, ny, nz]; optional
+checkpoints/<k>/            renders and alpha of the fit on its way; optional
 SHA256SUMS                  of every other file
 """
 
@@ -31,7 +32,7 @@ from splashbench.files import (
     write_text,
 )
 from splashbench.scene import Particles, Scene, SignedDistance
-from splashbench.submission.identity import Identity, Record, Status
+from splashbench.submission.identity import Checkpoint, Identity, Record, Status
 
 IDENTITY = "submission.toml"
 SUMS = "SHA256SUMS"
@@ -117,6 +118,14 @@ class Submission:
         """Rendered foreground opacity [H, W] in [0, 1] of test view `camera` at timestep `t`."""
         return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
 
+    def checkpoints(self) -> list[tuple[Checkpoint, CheckpointViews]]:
+        """The states of the fit on its way, with their views; of those that have some (status ok)."""
+        return [
+            (checkpoint, CheckpointViews(self, self.directory / checkpoint.folder))
+            for checkpoint in self.record.checkpoints
+            if checkpoint.status == Status.OK
+        ]
+
     def particles(self) -> Particles | None:
         """The method's particles, or None."""
         path = self.directory / "particles.npz"
@@ -126,6 +135,19 @@ class Submission:
         """The liquid's signed distance, or None."""
         path = self.directory / "geometry.npz"
         return SignedDistance.load(path) if path.is_file() else None
+
+
+class CheckpointViews:
+    """The views of one checkpoint: `rendering` and `alpha` as those of `Submission`, and its identity."""
+
+    def __init__(self, submission: Submission, directory: Path) -> None:
+        self.identity, self.directory = submission.identity, directory
+
+    def rendering(self, camera: str, t: int) -> NDArray[np.uint8]:
+        return read_image(render_path(self.directory, "renders", camera, t))
+
+    def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
+        return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
 
 
 def integrity_faults(directory: Path) -> list[str]:
@@ -184,6 +206,15 @@ def check_submission(directory: Path, scene: Scene | None = None) -> list[str]:
     for name, n_frames in instants.items():
         if n_frames != scene.n_frames:
             faults.append(f"{directory / name} has {n_frames} instants, the scene {scene.n_frames}")
+    faults += _view_faults(directory, scene)
+    for _, views in submission.checkpoints():
+        faults += _view_faults(views.directory, scene)
+    return faults
+
+
+def _view_faults(directory: Path, scene: Scene) -> list[str]:
+    """A line for every view below `directory` that is missing or has another size than the scene's."""
+    faults = []
     for name in scene.test:
         camera = scene.cameras[name]
         for t in range(scene.n_frames):

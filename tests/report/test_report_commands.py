@@ -60,7 +60,7 @@ def test_scores_become_a_leaderboard(runs: dict[str, Path], balls: Scene, tmp_pa
     assert answer["results"][1]["metrics"]["dpsnr_bg"] == 0.0
     assert "unlucky failed: NaN in the loss" in err
     assert "null lpips: no LPIPS weights" in err
-    files = sorted(path.name for path in results.iterdir())
+    files = sorted(path.name for path in results.glob("*.json"))
     assert [name.rpartition("__")[0] for name in files] == [
         "nothing__balls__best__seed0",
         "oracle__balls__truth__seed0",
@@ -68,11 +68,16 @@ def test_scores_become_a_leaderboard(runs: dict[str, Path], balls: Scene, tmp_pa
     ]
     assert Result.load(results / files[2]).reason == "NaN in the loss"
     assert read_image(sheet).std() > 10
+    # Pictures lie beside the results of runs that have any.
+    pictures = sorted(path.name for path in results.glob("*.jpg"))
+    assert pictures == [name.replace(".json", ".jpg") for name in files[:2]]
+    assert {path.suffix for path in results.iterdir()} == {".json", ".jpg"}
+    assert read_image(results / pictures[0]).std() > 10
 
     assert command("leaderboard", results, tmp_path / "board", "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["results"], answer["failed_runs"]) == (3, 1)
-    names = {"leaderboard.csv", "leaderboard.md", "speed_accuracy.png", "speed_accuracy.svg"}
+    names = {"index.html", "leaderboard.csv", "leaderboard.md", "speed_accuracy.png", "speed_accuracy.svg"}
     assert {path.name for path in (tmp_path / "board").iterdir()} == names
 
 

@@ -39,6 +39,7 @@ class FakeSubmission:
             method_version="1",
             preset="best",
             settings={"iterations": 10},
+            overrides=["iterations=10"],
             seed=self.seed,
             scene=self.scene.name,
             scene_digest=self.scene_digest or self.scene.digest,
@@ -52,7 +53,7 @@ class FakeSubmission:
     @property
     def record(self) -> SimpleNamespace:
         measured = {"fit_seconds": 12.5, "peak_memory_bytes": 1 << 20} if self.status == "ok" else {}
-        return SimpleNamespace(**(dict.fromkeys(_COSTS) | measured))
+        return SimpleNamespace(**(dict.fromkeys(_COSTS) | measured), checkpoints=[], stages={}, notes={})
 
     @property
     def digest(self) -> str:

@@ -54,7 +54,8 @@ class FitSettings:
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
     `AdaptiveSchedule`. prune_opacity: carriers whose learned opacity is below this at one of `_PRUNINGS` are not
     fitted any further; 0 fits all to the end. feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is
-    that of the shared parts.
+    that of the shared parts. coarse_share: of the iterations, the first ones, that see targets at half
+    their size where these have one.
     """
 
     iterations: int = 1000
@@ -71,6 +72,7 @@ class FitSettings:
     base_scale: float = 0.35
     prune_opacity: float = 0.0
     idle_share: float = 0.0
+    coarse_share: float = 0.0
     weights: losses.LossWeights = field(default_factory=losses.LossWeights)
 
 
@@ -191,8 +193,12 @@ def fit_appearance(
     color_cell: float,
     seed: int,
     progress: Callable[[float], None],
+    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]]], None] | None = None,
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
+
+    offer: is given, after every iteration, what makes the appearance as it is, and the carriers still fitted: bool
+    [count].
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -251,12 +257,16 @@ def fit_appearance(
         feature_rows, scale_rows = learned(target.frame, active)
         children, _ = decoder.decode(feature_rows, scale_rows, None, active.state, target.eye)
         # Colours of all tiles: liquid drawn beside the mask is to be taught that it does not belong there.
-        whole = replace(target, modes=None)
+        whole = replace(target.coarse or target, modes=None)
 
         def drawn(colors: Tensor) -> Tensor:
             return shown(replace(children, colors=colors), whole, active)[0]
 
         return least(contributions(children.colors, drawn), settings.idle_share)
+
+    @torch.no_grad()
+    def state() -> tuple[Appearance, np.ndarray]:
+        return Appearance(features.all(), appearance.log_scales, decoder), carriers.left(track.carriers.count)
 
     prunings = {round(share * settings.iterations) for share in _PRUNINGS}
     focusings = {round(share * settings.iterations) for share in _FOCUSINGS}
@@ -281,6 +291,8 @@ def fit_appearance(
         target = targets[queue.pop()]
         active = carriers.of(target)
         values = [table.requires_grad_() for table in learned(target.frame, active)]
+        if target.coarse is not None and iteration < settings.coarse_share * settings.iterations:
+            target = target.coarse
         image, alpha, penalty_terms = seen(target, active, values, penalised=True)
         assert penalty_terms is not None
         with_ssim = iteration % settings.ssim_every == 0
@@ -302,6 +314,8 @@ def fit_appearance(
         scales.step(active.ids, by_scale, factor)
         iteration += 1
         progress(schedule.done(iteration))
+        if offer is not None:
+            offer(state)
     appearance.features = features.all()
     return Fit(history, carriers.left(track.carriers.count))
 

@@ -38,14 +38,15 @@ class TrainingTarget:
     """One time-camera pair.
 
     frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
-    window, [h, w] pixels. photograph: image and mask of the mask's padded bounding box, the only ones
-    kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all Gaussians. area: pixels over which the
-    silhouette term averages. hidden: uint8 [n], by how many 255ths the container hides each carrier of the
-    frame from the view, or None.
+    window, [h, w] pixels. corner: x and y of the window's first pixel in the image. photograph: image and mask of the
+    mask's padded bounding box, the only ones kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all
+    Gaussians. area: pixels over which the silhouette term averages. hidden: uint8 [n], by how many 255ths the container
+    hides each carrier of the frame from the view, or None.
     wall: float32 [h, w], share of each pixel in which the container's near wall lies before the liquid, or None;
     in_front: bool [n], carriers of the frame that lie before the wall, or None for none.
     frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
     the losses read, see `splashbench.render.tile_modes`.
+    coarse: the same at half the size, for the fit's first part, or None; see coarse.py.
     """
 
     frame: int
@@ -60,6 +61,8 @@ class TrainingTarget:
     modes: np.ndarray | None = None
     wall: Tensor | None = None
     in_front: Tensor | None = None
+    corner: tuple[int, int] = (0, 0)
+    coarse: TrainingTarget | None = None
 
 
 def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
@@ -112,6 +115,7 @@ def collect_targets(
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
     cut: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray] | None] | None = None,
     frozen: Mapping[str, Frozen] | None = None,
+    even: bool = False,
 ) -> list[TrainingTarget]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
@@ -122,7 +126,7 @@ def collect_targets(
     (bool [n]); None for none. frozen: of each view, Gaussians of the background that are drawn together with
     the liquid's. silhouette_norm: the silhouette term averages over the "image", as in the paper, whose images are
     crops about the liquid; or over the "window" around all masks of the view, such a crop of images that are none; or
-    over the "mask".
+    over the "mask". even: windows begin at even pixels, so that half-size ones are parts of half-size images.
     """
     frozen = frozen or {}
     targets = []
@@ -147,6 +151,8 @@ def collect_targets(
                 continue
             box = _extent(mask, MASK_MARGIN)
             x0, y0, x1, y1 = (0, 0, camera.width, camera.height) if whole else _window(camera, box, positions)
+            if even:
+                x0, y0 = x0 - x0 % 2, y0 - y0 % 2
             part = slice(box[1], box[3]), slice(box[0], box[2])
             photograph = WindowPhotograph(
                 torch.from_numpy(scene.image(name, t)[part].copy()),
@@ -170,6 +176,7 @@ def collect_targets(
                     modes=_modes(camera, box) if name in frozen else None,
                     wall=None if share is None else torch.from_numpy(share)[y0:y1, x0:x1],
                     in_front=None if in_front is None or not in_front.any() else torch.from_numpy(in_front),
+                    corner=(x0, y0),
                 )
             )
     return targets

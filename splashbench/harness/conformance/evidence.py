@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,12 +18,14 @@ from splashbench.harness.conformance.subject import Answer, Subject
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.runner import run_method
 from splashbench.scene import Scene
-from splashbench.submission import Status, check_submission
+from splashbench.submission import Checkpoint, Status, check_submission
 from splashbench.synth.balls import write_balls_scene
 
 SEED, OTHER_SEED = 0, 1
 #: The preset for trying a method, where it has one of this name.
 _QUICK = "quick"
+#: When states are taken, as shares of the fit; one of them early, since methods tend to change their ways.
+_CHECKPOINTS = (0.05, 0.6)
 
 
 @dataclass
@@ -35,6 +37,7 @@ class OrdinaryRun:
     fit_seconds: float
     seconds: float
     model: Path
+    checkpoints: Sequence[Checkpoint] = ()
 
     @property
     def ok(self) -> bool:
@@ -117,11 +120,20 @@ class Evidence:
     @cached_property
     def run(self) -> OrdinaryRun:
         """The run that a user would make, on the scene as it is."""
+        return self._run("run", "the run")
+
+    @cached_property
+    def checkpointed(self) -> OrdinaryRun:
+        """The same run, with states taken on its way."""
+        marks = [share * self.run.fit_seconds for share in _CHECKPOINTS]
+        return self._run("checkpointed", "the run with checkpoints", marks)
+
+    def _run(self, name: str, what: str, checkpoints: Sequence[float] | None = None) -> OrdinaryRun:
         _ = self.before
-        out, start = self.bench.folder("run") / "submission", time.monotonic()
+        out, start = self.bench.folder(name) / "submission", time.monotonic()
         run = OrdinaryRun("refused", "", 0.0, 0.0, out / "model")
         try:
-            with self.bench.process("the run"):
+            with self.bench.process(what):
                 submission = run_method(
                     self.name,
                     self.ordinary.scene,
@@ -132,6 +144,7 @@ class Evidence:
                     device=self.device,
                     timeout_seconds=self.timeout_seconds,
                     timing_frames=0,
+                    checkpoints=checkpoints,
                 )
         except DiskFullError:
             raise
@@ -146,6 +159,7 @@ class Evidence:
             reason=reason,
             fit_seconds=submission.record.fit_seconds or 0.0,
             seconds=time.monotonic() - start,
+            checkpoints=submission.record.checkpoints,
         )
 
     def good_run(self) -> OrdinaryRun | None:
@@ -174,6 +188,11 @@ class Evidence:
     def reloaded(self) -> Answer:
         """The model of the ordinary run, loaded in a fresh process on the scene as it is."""
         return self._load(self.ordinary, self.run.model)
+
+    @cached_property
+    def reloaded_checkpointed(self) -> Answer:
+        """The model that the run with checkpoints left, loaded likewise."""
+        return self._load(self.ordinary, self.checkpointed.model)
 
     @cached_property
     def refitted(self) -> Answer:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splashbench.harness.conformance.evidence import SEED, Evidence, complete, complete_fit, differences
 from splashbench.harness.conformance.report import Judgement, NotTested, Verdict, check, judge
+from splashbench.submission import Status
 
 
 @check(
@@ -34,6 +35,29 @@ def _difference(evidence: Evidence) -> str | None:
 
 def _run_fault(evidence: Evidence) -> str:
     return f"the run with them ended as {evidence.run.status}: {evidence.run.reason}"
+
+
+@check(
+    "states of the fit on its way render, and taking them changes nothing",
+    "let the function given to run.checkpoint() copy what it needs, and change nothing that the fit goes on with",
+)
+def checkpoints(evidence: Evidence) -> Judgement:
+    if not evidence.run.ok:
+        raise NotTested(f"the run without them ended as {evidence.run.status}")
+    run = evidence.checkpointed
+    if not run.ok:
+        return Verdict.FAILED, f"{run.status}: {run.reason}"
+    if not run.checkpoints:
+        return Verdict.OK, "none was offered: its end alone stands in charts of quality over time"
+    bad = [f"after {c.seconds:.1f} s: {c.status.value}: {c.reason}" for c in run.checkpoints if c.status != Status.OK]
+    if bad:
+        return Verdict.FAILED, bad[0]
+    plain = complete(evidence.reloaded, "loading")
+    taken = complete(evidence.reloaded_checkpointed, "loading")
+    faults = differences(plain.digests, taken.digests, "where states were taken on the way")
+    if faults and same_seed.judgement(evidence)[0] != Verdict.OK:
+        raise NotTested("two fits with one seed differ, so nothing can be told from a third")
+    return judge(faults, f"{len(run.checkpoints)} states")
 
 
 @check("another seed is accepted", "take any seed of 0 or more")

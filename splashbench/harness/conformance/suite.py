@@ -18,13 +18,19 @@ from splashbench.harness.conformance.report import Check, Finding, Report
 TIMEOUT_SECONDS = 600.0
 # What follows the first run, counted in fits (those stopped half way and those of small scenes are parts of one) and
 # in starts of processes (what a run spends besides its fit).
-_FITS, _STARTS = 4.0, 6.0
+_FITS, _STARTS = 5.0, 10.0
 #: From here on it is worth telling how long it will take.
 _LONG_SECONDS = 30.0
 CHECKS: tuple[Check, ...] = (
     *(model.metadata, model.fit, model.progress, model.files, model.load, model.again),
     *(model.views, model.between, model.size, model.principal_point, model.particles, model.signed_distance),
-    *(scene_access.same_seed, scene_access.other_seed, scene_access.hidden_test_views, scene_access.unread_test_views),
+    *(
+        scene_access.same_seed,
+        scene_access.checkpoints,
+        scene_access.other_seed,
+        scene_access.hidden_test_views,
+        scene_access.unread_test_views,
+    ),
     *(scene_access.unchanged_scene, scene_access.writes),
     *(stopping.time_limit, stopping.signals, stopping.processes),
     *(model.one_frame, model.no_liquid),

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import html
-
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.pages.blocks import Block, Bullets, Note, Table
 from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
 from splashbench.prepare.preparation import Preparation
-from splashbench.prepare.report.html import SWEEP_COLOUR, TEST_COLOUR, TRAIN_COLOUR, bullets, figure_html, table
+from splashbench.prepare.report.pictures import SWEEP_COLOUR, TEST_COLOUR, TRAIN_COLOUR, chart
 
 
-def cameras_section(preparation: Preparation) -> list[str]:
+def cameras_section(preparation: Preparation) -> list[Block]:
     """The rig from above and from the front with every camera's viewing direction, and a table of the poses."""
     from matplotlib.figure import Figure
 
@@ -64,15 +63,15 @@ def cameras_section(preparation: Preparation) -> list[str]:
     note = "±: standard deviation relative to the other fixed cameras, from the noise of the features alone."
     attempts = [f"Structure from motion tried more than once: {line}" for line in poses.attempts[:-1]]
     return [
-        figure_html(figure),
-        f'<p class="note">{html.escape(text)}</p>',
-        table(header, rows),
-        f'<p class="note">{note}</p>',
-        *(bullets(attempts) if attempts else []),
+        chart(figure, "the rig from above and from the front"),
+        Note(text),
+        Table(header, rows),
+        Note(note),
+        *([Bullets(attempts)] if attempts else []),
     ]
 
 
-def lenses_section(preparation: Preparation) -> list[str]:
+def lenses_section(preparation: Preparation) -> list[Block]:
     """A table of the lenses, and where in the image their boards were seen."""
     from matplotlib.figure import Figure
 
@@ -111,7 +110,7 @@ def lenses_section(preparation: Preparation) -> list[str]:
         "Pixels. Errors are RMS over corners. Views: used / with a board / searched. Below: all corners used, on the"
         " cells that coverage counts."
     )
-    return [table([*header, "views"], rows), f'<p class="note">{note}</p>', figure_html(figure)]
+    return [Table([*header, "views"], rows), Note(note), chart(figure, "where the boards' corners were seen")]
 
 
 def camera_centre(w2c: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from splashbench.pages.blocks import Block, Note, Table
 from splashbench.prepare.preparation import Preparation
-from splashbench.prepare.report.html import SWEEP_COLOUR, TRAIN_COLOUR, figure_html, table
+from splashbench.prepare.report.pictures import SWEEP_COLOUR, TRAIN_COLOUR, chart
 
 
-def clocks_section(preparation: Preparation) -> list[str]:
+def clocks_section(preparation: Preparation) -> list[Block]:
     """A table of the clocks, the windows they were fitted to, and the sound's travel."""
     offsets = preparation.sequence.offsets_s
     rows = [
@@ -39,8 +40,8 @@ def clocks_section(preparation: Preparation) -> list[str]:
         " windows agree; a bend would be a clock whose rate changed."
     )
     return [
-        table(header, rows),
-        f'<p class="note">{note}</p>',
+        Table(header, rows),
+        Note(note),
         *_windows(preparation),
         *_sound_paths(preparation),
     ]
@@ -57,7 +58,7 @@ def _both(preparation: Preparation) -> str:
     )
 
 
-def _windows(preparation: Preparation) -> list[str]:
+def _windows(preparation: Preparation) -> list[Block]:
     """Where the windows' delays lie about every camera's clock."""
     from matplotlib.figure import Figure
 
@@ -75,10 +76,10 @@ def _windows(preparation: Preparation) -> list[str]:
         axes.set_title(f"camera {camera}", fontsize=9)
         axes.set(xlabel="local time [s]", ylabel="delay [us]")
         axes.tick_params(labelsize=8)
-    return [figure_html(figure)]
+    return [chart(figure, "the windows' delays from each camera's clock")]
 
 
-def _sound_paths(preparation: Preparation) -> list[str]:
+def _sound_paths(preparation: Preparation) -> list[Block]:
     paths = preparation.sound_paths
     rows = [
         [camera, f"{paths.distance_m[camera]:.2f}", f"{paths.shift_s[camera] * 1e3:+.2f}"]
@@ -93,10 +94,10 @@ def _sound_paths(preparation: Preparation) -> list[str]:
             " them as below. To correct for it, give [sound] source in session.toml."
         )
     header = ["camera", "path of the sound [m]", "shift of the clock [ms]"]
-    return [f'<p class="note">{note}</p>', table(header, rows)]
+    return [Note(note), Table(header, rows)]
 
 
-def recordings_section(preparation: Preparation) -> list[str]:
+def recordings_section(preparation: Preparation) -> list[Block]:
     """A table of the recordings of the pour."""
     rows = []
     for camera, video in preparation.synced.videos.items():
@@ -126,4 +127,4 @@ def recordings_section(preparation: Preparation) -> list[str]:
         "sound - video [ms]",
         "gaps in the sound",
     ]
-    return [table(header, rows)]
+    return [Table(header, rows)]

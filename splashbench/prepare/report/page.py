@@ -6,15 +6,17 @@ tells of the scene alone, not of the run that made it, so that the same recordin
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
+from pathlib import Path
 
+from splashbench.pages import render
+from splashbench.pages.blocks import Block, Bullets, Note, Sheet, Table
 from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.masks.sheet import fault_note, mask_sheet, sheet_times
 from splashbench.prepare.preparation import Preparation
 from splashbench.prepare.report.cameras import cameras_section, lenses_section
 from splashbench.prepare.report.clocks import clocks_section, recordings_section
-from splashbench.prepare.report.html import STYLE, bullets, figure_html, image_uri, section, table
+from splashbench.prepare.report.pictures import chart, photograph
 
 
 def html_report(preparation: Preparation) -> str:
@@ -22,29 +24,26 @@ def html_report(preparation: Preparation) -> str:
     session = preparation.session
     warnings = len(preparation.warnings)
     verdict = "All gates passed." if not warnings else f"{warnings} of {len(preparation.gates)} gates failed."
-    body = [
-        f"<h1>Preparation of {html.escape(session.name)}</h1>",
-        f"<p>{len(session.cameras)} cameras, {len(preparation.sampling.times)} timesteps from"
+    summary = (
+        f"{len(session.cameras)} cameras, {len(preparation.sampling.times)} timesteps from"
         f" {preparation.motion.start:.3f} to {preparation.motion.end:.3f} s on the clock of camera"
-        f" {html.escape(session.reference)}. {verdict}</p>",
-        *section("Gates", _gates(preparation)),
-        *section(f"Masks ({preparation.masks.provider})", _masks(preparation)),
-        *section("Cameras", cameras_section(preparation)),
-        *(section("Container", _container(preparation.container, preparation)) if preparation.container else []),
-        *section("Lenses", lenses_section(preparation)),
-        *section("Clocks", clocks_section(preparation)),
-        *section("Motion interval", bullets(preparation.motion.reasons)),
-        *section("Recordings", recordings_section(preparation)),
-    ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>Preparation of {html.escape(session.name)}</title><style>{STYLE}</style></head>\n<body>\n"
-        + "\n".join(body)
-        + "\n</body></html>\n"
+        f" {session.reference}. {verdict}"
     )
+    sections = [
+        ("Gates", _gates(preparation)),
+        (f"Masks ({preparation.masks.provider})", _masks(preparation)),
+        ("Cameras", cameras_section(preparation)),
+        ("Container", _container(preparation.container, preparation) if preparation.container else []),
+        ("Lenses", lenses_section(preparation)),
+        ("Clocks", clocks_section(preparation)),
+        ("Motion interval", [Bullets(preparation.motion.reasons)]),
+        ("Recordings", recordings_section(preparation)),
+    ]
+    folder = Path(__file__).parent
+    return render(folder, "preparation.html.j2", name=session.name, summary=summary, sections=sections)
 
 
-def _gates(preparation: Preparation) -> list[str]:
+def _gates(preparation: Preparation) -> list[Block]:
     rows = [
         [
             gate.name.replace("_", " "),
@@ -56,10 +55,10 @@ def _gates(preparation: Preparation) -> list[str]:
         for gate in preparation.gates
     ]
     classes = ["passed" if gate.passed else "failed" for gate in preparation.gates]
-    return [table(["gate", "value", "limit", "outcome", "what it is"], rows, classes)]
+    return [Table(["gate", "value", "limit", "outcome", "what it is"], rows, classes)]
 
 
-def _masks(preparation: Preparation) -> list[str]:
+def _masks(preparation: Preparation) -> list[Block]:
     from matplotlib.figure import Figure
 
     times = preparation.sampling.times
@@ -79,7 +78,7 @@ def _masks(preparation: Preparation) -> list[str]:
         preparation.pictures.sheet,
         {camera: fault_note(faults, len(times)) for camera, faults in preparation.masks.faults.items()},
     )
-    picture = f'<p><img alt="contact sheet of the masks" src="{image_uri(sheet)}"></p>'
+    picture = photograph(sheet, "contact sheet of the masks")
     rows = [
         [
             camera,
@@ -94,7 +93,7 @@ def _masks(preparation: Preparation) -> list[str]:
         )
     ]
     header = ["camera", "empty frames", "failed frames", "image written", "its top left in the frame"]
-    return [figure_html(figure), table(header, rows), picture]
+    return [chart(figure, "area of the masks over time, a line per camera"), Table(header, rows), picture]
 
 
 def _frames(positions: Sequence[int]) -> str:
@@ -104,7 +103,7 @@ def _frames(positions: Sequence[int]) -> str:
     return listed if len(positions) <= 8 else f"{listed} and {len(positions) - 8} more"
 
 
-def _container(placed: PlacedContainer, preparation: Preparation) -> list[str]:
+def _container(placed: PlacedContainer, preparation: Preparation) -> list[Block]:
     """Where the mesh lies: its projected outline (blue) on the mask's (amber), and how well they agree."""
     placement = placed.placement
     turns = {
@@ -122,18 +121,13 @@ def _container(placed: PlacedContainer, preparation: Preparation) -> list[str]:
         ]
         for camera, projection in placed.projections.items()
     ]
-    sheet = [
-        f'<figure><img alt="camera {html.escape(camera)}" src="{image_uri(image)}">'
-        f"<figcaption>camera {html.escape(camera)}</figcaption></figure>"
+    overlays = [
+        photograph(image, f"camera {camera}: the mesh projected onto its mask", f"camera {camera}")
         for camera, image in preparation.pictures.overlays.items()
     ]
     ambiguous = " Another of its axes could be up as well; give up in [container]." if placement.up_is_ambiguous else ""
     header = ["camera", "view", "IoU", "outline RMS [px]", "outline median [px]"]
-    return [
-        f'<p class="note">{turns[placement.turn]}{ambiguous} Only training views placed it. Blue: the mesh projected;'
-        " amber: the mask.</p>",
-        table(header, rows),
-        '<div class="sheet">',
-        *sheet,
-        "</div>",
-    ]
+    note = (
+        f"{turns[placement.turn]}{ambiguous} Only training views placed it. Blue: the mesh projected; amber: the mask."
+    )
+    return [Note(note), Table(header, rows), Sheet(overlays)]

@@ -359,6 +359,40 @@ class Slow(Sky):
             clock.sleep(300)
 
 
+class Offers(Sky):
+    """Offers its state at every step, and takes long enough for two of them."""
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Model:
+        self.phase = np.zeros(3)
+        for step in range(config.steps):
+            self.step(scene, config, run, step)
+            clock.sleep(0.2)
+            self.phase = self.phase + self.rng(run).uniform(0, 1, 3)
+            run.checkpoint(lambda: self.state(scene))
+        return self.model(np.full(3, 0.5), self.phase, scene)
+
+    def state(self, scene: TrainingScene) -> Model:
+        return self.model(np.full(3, 0.5), self.phase, scene)
+
+
+class OffersAndChanges(Offers):
+    """Goes on from a rounded state once it was asked for it."""
+
+    def state(self, scene: TrainingScene) -> Model:
+        self.phase = self.phase.round(1)
+        return super().state(scene)
+
+
+class OffersTooEarly(Offers):
+    """Its first state is none."""
+
+    def state(self, scene: TrainingScene) -> Model:
+        model = super().state(scene)
+        if self.phase.max() < 1:
+            model.mean = np.full(3, np.nan)
+        return model
+
+
 # --- scenes at the edge
 
 

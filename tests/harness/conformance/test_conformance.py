@@ -28,7 +28,7 @@ def test_a_sound_method_passes_every_check() -> None:
     assert {finding.name: finding.detail for finding in report.findings if finding.verdict != Verdict.OK} == {}
     assert report.passed
     assert heard == [finding.name for finding in report.findings]
-    assert len(heard) == 23
+    assert len(heard) == 24
     assert report.preset == "quick"
     assert report.fit_seconds is not None
 
@@ -120,6 +120,21 @@ def test_geometry_that_is_not_whole(name: str, failed: str, said: str) -> None:
     details = verdicts(tried(name, ["views", "particles", "signed_distance"]), Verdict.FAILED)
     assert set(details) == {failed}
     assert said in details[failed]
+
+
+def test_states_on_the_way_are_taken() -> None:
+    assert verdicts(tried("Offers", ["checkpoints"]), Verdict.OK) == {"checkpoints": "2 states"}
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("OffersAndChanges", "camera 6, timestep 0 differs where states were taken on the way"),
+        ("OffersTooEarly", "not_finite: camera 6, timestep 0: the render has NaN"),
+    ],
+)
+def test_states_on_the_way_that_are_wrong_or_change_the_fit(name: str, said: str) -> None:
+    assert said in verdicts(tried(name, ["checkpoints"]), Verdict.FAILED)["checkpoints"]
 
 
 def test_a_seed_that_is_refused() -> None:

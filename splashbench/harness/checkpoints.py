@@ -1,0 +1,79 @@
+"""Checkpoints: states of a fit that is under way, saved outside its clock.
+
+A method offers its state as often as it likes (`Run.checkpoint`). At the marks, the same for every method, the harness
+takes one. Making and saving it are no part of the fit's time, nor of the stage that it falls into.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+#: Seconds of the fit at which a state is asked for: 5, 10, 20, 40 and so on, for a month.
+MARKS = tuple(5.0 * 2**k for k in range(20))
+
+
+class Savable(Protocol):
+    """What `splashbench.harness.contract.Fitted` has of use here."""
+
+    def save(self, directory: Path) -> None:
+        """Write the model into the empty folder `directory`."""
+        ...
+
+
+class Checkpoints:
+    """Takes the states of one fit, each into a folder of its own below `folder`: 00, 01 and so on.
+
+    Attributes:
+        seconds: of the fit, when each state was offered; never before its mark.
+        spent: seconds that making and saving them took.
+    """
+
+    def __init__(
+        self, folder: Path, marks: Sequence[float], elapsed: Callable[[], float], synchronise: Callable[[], None]
+    ) -> None:
+        """marks: rising seconds. elapsed: those of the fit so far. synchronise: waits for what a device computes."""
+        self.seconds: list[float] = []
+        self.spent = 0.0
+        self._folder, self._elapsed, self._synchronise = folder, elapsed, synchronise
+        self._left = list(reversed(marks))
+
+    def offer(self, state: Callable[[], Savable]) -> float:
+        """Take what `state` makes where a mark has come; returns the seconds that this took, 0 where none has."""
+        if not self._left or self._elapsed() < self._left[-1]:
+            return 0.0
+        self._synchronise()
+        elapsed, start = self._elapsed(), time.perf_counter()
+        place = self._folder / f"{len(self.seconds):02d}"
+        place.mkdir(parents=True)
+        with _random_numbers_kept():
+            state().save(place)
+        self.seconds.append(elapsed)
+        # Of the marks that one long step went past, one state serves all.
+        while self._left and self._left[-1] <= elapsed:
+            self._left.pop()
+        spent = time.perf_counter() - start
+        self.spent += spent
+        return spent
+
+
+@contextmanager
+def _random_numbers_kept() -> Iterator[None]:
+    """Whatever is drawn within from the global generators of Python, numpy and torch is drawn again after."""
+    torch = sys.modules.get("torch")
+    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002 - whoever draws from it is to be undone
+    drawn = torch.random.get_rng_state() if torch is not None else None
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(legacy)  # noqa: NPY002
+        if torch is not None:
+            torch.random.set_rng_state(drawn)

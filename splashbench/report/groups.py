@@ -1,0 +1,100 @@
+"""Results that may be compared: one machine, one protocol, and scenes that told the same; and in each the methods.
+
+Figures of two groups never share a chart or a mean: they would compare machines, protocols or hints, not methods.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from splashbench.report.results import ResultFile
+from splashbench.score.result import Result
+
+
+@dataclass
+class Entry:
+    """A method with its settings within a group. label: names it there. results: in the order of scene and seed."""
+
+    label: str
+    results: list[Result] = field(default_factory=list)
+
+    @property
+    def first(self) -> Result:
+        """Any of the results: what names a method is the same in all."""
+        return self.results[0]
+
+    @property
+    def scenes(self) -> set[str]:
+        """Digests of the scenes it ran on, whatever came out."""
+        return {result.digests.scene for result in self.results}
+
+
+@dataclass
+class Group:
+    """What was measured on one machine by one protocol with scenes that told the same; told: None where not noted."""
+
+    machine: str
+    protocol: str
+    told: tuple[str, ...] | None
+    entries: list[Entry] = field(default_factory=list)
+    controls: list[Entry] = field(default_factory=list)
+
+    @property
+    def scenes(self) -> dict[str, str]:
+        """Digest to name of every scene, in the order of names; those of one name are told apart by their digests."""
+        found = {r.digests.scene: r.scene for entry in [*self.entries, *self.controls] for r in entry.results}
+        names = list(found.values())
+        shown = {d: name if names.count(name) == 1 else f"{name} {d[:8]}" for d, name in found.items()}
+        return dict(sorted(shown.items(), key=lambda item: item[1]))
+
+    @property
+    def told_text(self) -> str:
+        """What the scenes told, in words."""
+        return told_text(self.told)
+
+
+def told_text(told: tuple[str, ...] | None) -> str:
+    """`Result.told` in words."""
+    if told is None:
+        return "not noted"
+    return ", ".join(told) or "nothing"
+
+
+def groups(sources: Sequence[ResultFile]) -> list[Group]:
+    """All results, by group and entry, in one order. Nothing is left out: failed runs stand with the others."""
+    by_key: dict[tuple[str, str, str], list[Result]] = defaultdict(list)
+    for source in sources:
+        result = source.result
+        by_key[result.hardware_label, result.protocol_label, told_text(result.told)].append(result)
+    return [_group(results) for _, results in sorted(by_key.items())]
+
+
+def _group(results: list[Result]) -> Group:
+    group = Group(results[0].hardware_label, results[0].protocol_label, results[0].told)
+    names = labels(results)
+    entries: dict[str, Entry] = {}
+    for result in sorted(results, key=lambda r: (r.scene, r.digests.scene, r.seed, r.digests.submission)):
+        label = names[entry_key(result)]
+        entries.setdefault(label, Entry(label)).results.append(result)
+    for label in sorted(entries):
+        (group.controls if entries[label].first.control else group.entries).append(entries[label])
+    return group
+
+
+def entry_key(result: Result) -> tuple[str, str, str]:
+    """Method, preset and settings: runs that differ in any are never averaged."""
+    return (result.method, result.preset, result.settings_digest)
+
+
+def labels(results: Iterable[Result]) -> dict[tuple[str, str, str], str]:
+    """Method, with the preset where it has several, and the settings' digest where a preset has several."""
+    keys = {entry_key(result) for result in results}
+    found = {}
+    for method, preset, digest in keys:
+        presets = {key[1] for key in keys if key[0] == method}
+        twins = {key for key in keys if key[:2] == (method, preset)}
+        label = method if len(presets) == 1 else f"{method} [{preset}]"
+        found[method, preset, digest] = label if len(twins) == 1 else f"{label} {digest}"
+    return found

@@ -1,0 +1,221 @@
+"""What the leaderboard's page holds, as plain data: groups with their statistics, runs, and rows of the table.
+
+The page's script draws and filters; every statistic is computed here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pandas as pd
+
+from splashbench.report.anytime import (
+    BUDGETS,
+    QUALITY,
+    by_scene,
+    chases,
+    curves,
+    hypervolumes,
+    standings,
+)
+from splashbench.report.groups import Entry, Group, told_text
+from splashbench.report.statistics import Estimate, estimate
+from splashbench.score.metrics import METRICS
+from splashbench.score.notation import FILTER_MARK, in_shown_unit, label, shown
+from splashbench.score.result import Result
+
+#: Metrics of the table, of the charts' axes, and of a run's details.
+TABLE = ("psnr", "lpips", "ssim", "miou", "spill", "jitter_error", "fit_seconds", "peak_memory_bytes", "storage_bytes")
+COSTS = ("fit_seconds", "peak_memory_bytes", "storage_bytes", "render_fps", "primitives_per_frame")
+QUALITIES = (*QUALITY, "dpsnr_bg", "ssim", "spill", "jitter_error", "uniformity")
+_SHOWN = tuple(dict.fromkeys((*TABLE, *COSTS, *QUALITIES)))
+_DIGITS = 6
+
+
+def metric_facts() -> dict[str, dict[str, Any]]:
+    """What the script has to know of each metric that is shown: label, direction, decimals, whether log is natural."""
+    return {
+        name: {
+            "label": label(METRICS[name], arrow=False),
+            "title": METRICS[name].title,
+            "better": METRICS[name].better,
+            "filtered": METRICS[name].filtered,
+            "log": METRICS[name].group == "cost",
+        }
+        for name in _SHOWN
+    }
+
+
+def group_facts(group: Group) -> dict[str, Any]:
+    """A group's curves, standings, estimates and chases, all of them over all of its scenes."""
+    return {
+        "machine": group.machine,
+        "protocol": group.protocol,
+        "told": group.told_text,
+        "scenes": list(group.scenes.values()),
+        "entries": [entry.label for entry in group.entries],
+        "curves": {name: [_curve(curve) for curve in curves(group, name)] for name in QUALITY},
+        "standings": {name: [_standing(name, standing) for standing in standings(group, name)] for name in QUALITY},
+        "estimates": {entry.label: _estimates(group, entry) for entry in group.entries},
+        "hypervolumes": {name: _estimate(found) for name, found in hypervolumes(group).items()},
+        "chases": {
+            name: [
+                {**vars(chase), "ratio": None if math.isinf(chase.ratio) else rounded(chase.ratio)}
+                for chase in chases(group, name)
+            ]
+            for name in ("psnr", "lpips")
+        },
+    }
+
+
+def _curve(curve: Any) -> dict[str, Any]:
+    ends = [found.interval or (found.value, found.value) for found in curve.estimates]
+    return {
+        "label": curve.label,
+        "x": [rounded(seconds) for seconds in curve.seconds],
+        "y": [rounded(found.value) for found in curve.estimates],
+        "low": [rounded(low) for low, _ in ends],
+        "high": [rounded(high) for _, high in ends],
+        "runs": curve.runs,
+        "scenes": curve.scenes,
+    }
+
+
+def _standing(name: str, standing: Any) -> dict[str, Any]:
+    lead = standing.lead
+    return {
+        "seconds": standing.seconds,
+        "ranking": [{"label": label, **_estimate(found)} for label, found in standing.ranking],
+        "lead": None
+        if lead is None
+        else {
+            "difference": _estimate(lead.difference),
+            "probability": None if math.isnan(lead.probability) else rounded(lead.probability),
+            "pairs": lead.pairs,
+            "text": shown(METRICS[name], lead.difference.value),
+        },
+    }
+
+
+def _estimate(found: Estimate) -> dict[str, Any]:
+    interval = None if found.interval is None else [rounded(end) for end in found.interval]
+    return {"value": rounded(found.value), "interval": interval}
+
+
+def _estimates(group: Group, entry: Entry) -> dict[str, Any]:
+    """Inter-quartile mean of each metric over the entry's runs, and how many there are and failed."""
+    figures: dict[str, Any] = {}
+    fine = [result for result in entry.results if result.status == "ok"]
+    for name in _SHOWN:
+        values = {(r.digests.scene, r.seed): v for r in fine if (v := r.value(name)) is not None}
+        if values:
+            scale = in_shown_unit(METRICS[name], 1.0)
+            found = estimate([scale * part for part in by_scene(values)])
+            figures[name] = {**_estimate(found), "runs": len(values)}
+    return {
+        "figures": figures,
+        "runs": len(entry.results),
+        "failed": len(entry.results) - len(fine),
+        "scenes": len(entry.scenes),
+        "of_scenes": len(group.scenes),
+        "mixed": entry.first.mixed,
+    }
+
+
+def run_facts(result: Result, group: int, label: str, path: str) -> dict[str, Any]:
+    """One run: its figures in shown units, its course, and what its details tell. `path`: of its file."""
+    figures = {
+        name: rounded(in_shown_unit(METRICS[name], value))
+        for name in _SHOWN
+        if (value := result.value(name)) is not None
+    }
+    course = [
+        [rounded(c.seconds), *(None if (value := c.metrics.get(n)) is None else rounded(value) for n in QUALITY)]
+        for c in result.checkpoints
+        if c.status == "ok"
+    ]
+    return {
+        "group": group,
+        "label": label,
+        "scene": result.scene,
+        "seed": result.seed,
+        "status": result.status,
+        "reason": result.reason,
+        "control": result.control,
+        "figures": figures,
+        "course": course,
+        "stages": {name: rounded(seconds) for name, seconds in result.stages.items()},
+        "notes": result.notes,
+        "file": path,
+        "command": command(result),
+        "submission": result.digests.submission[:12],
+        "missing": sorted(
+            {m.reason for n, m in result.metrics.items() if m.value is None and m.reason and n in _SHOWN}
+            if result.status == "ok"
+            else ()
+        ),
+    }
+
+
+def command(result: Result) -> str:
+    """The command that makes the run again, as far as a result tells it."""
+    if result.method == "oracle":
+        return f"splashbench run oracle {shlex.quote(f'scenes/{result.scene}')} OUT"
+    parts = ["splashbench", "run", result.method, f"scenes/{result.scene}", "OUT"]
+    parts += ["--preset", result.preset, "--seed", str(result.seed)]
+    if result.withheld:
+        parts += ["--withhold", result.withheld]
+    if result.checkpoints:
+        parts.append("--checkpoints")
+    for override in result.overrides:
+        parts += ["--set", override]
+    return shlex.join(parts)
+
+
+def row_facts(row: pd.Series, group: int, label: str, runs: list[int]) -> dict[str, Any]:
+    """A row of the table: medians over seeds in shown units, text as people read it, and numbers to sort by."""
+    first: Result = row["results"][0]
+    cells = {}
+    for name in TABLE:
+        value = row[name]
+        if value is None or math.isnan(value):
+            continue
+        mark = FILTER_MARK if first.mixed and METRICS[name].filtered else ""
+        cells[name] = [rounded(in_shown_unit(METRICS[name], value)), shown(METRICS[name], value) + mark]
+    return {
+        "scene": first.scene,
+        "digest": first.digests.scene[:8],
+        "method": first.method,
+        "label": label,
+        "preset": first.preset,
+        "version": first.method_version,
+        "settings": first.settings_digest,
+        "machine": first.hardware_label,
+        "protocol": first.protocol_label,
+        "told": told_text(first.told),
+        "status": first.status,
+        "control": first.control,
+        "seeds": row["seed"],
+        "cells": cells,
+        "group": group,
+        "runs": runs,
+    }
+
+
+def distinct_settings(results: Iterable[Result]) -> dict[str, Mapping[str, Any]]:
+    """Settings by their digest: many runs share them."""
+    found = {result.settings_digest: result.settings for result in results}
+    return {digest: json.loads(json.dumps(found[digest], default=str)) for digest in sorted(found)}
+
+
+def rounded(value: float) -> float | None:
+    """`value` to six significant digits; None for what is no number, which JSON cannot hold."""
+    return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+
+
+#: Budgets of the standings, for the script.
+BUDGET_SECONDS = list(BUDGETS)

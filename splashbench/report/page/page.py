@@ -1,0 +1,99 @@
+"""leaderboard: index.html, one file that needs no network: data, script, style and the chart library are in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from splashbench.pages import render
+from splashbench.report.groups import entry_key, groups, labels, told_text
+from splashbench.report.page.content import (
+    BUDGET_SECONDS,
+    COSTS,
+    QUALITIES,
+    TABLE,
+    distinct_settings,
+    group_facts,
+    metric_facts,
+    row_facts,
+    run_facts,
+)
+from splashbench.report.results import ResultFile
+from splashbench.report.speed_accuracy import reported_machine
+
+PAGE = "index.html"
+_HERE = Path(__file__).parent
+
+
+def leaderboard_page(
+    table: pd.DataFrame,
+    sources: Sequence[ResultFile],
+    with_paper: bool = False,
+    sheets: Mapping[str, str] | None = None,
+) -> str:
+    """The page as text; the same results give the same bytes.
+
+    Args:
+        table: from `leaderboard_table(sources)`.
+        with_paper: the paper's figures, hollow and in a group of their own.
+        sheets: contact sheets by the path of a result's file: an address, such as one that holds the picture.
+    """
+    from plotly.offline import get_plotlyjs
+
+    found = groups(sources)
+    by_group = {(g.machine, g.protocol, g.told_text): n for n, g in enumerate(found)}
+    names = {
+        n: labels(result for entry in [*g.entries, *g.controls] for result in entry.results)
+        for n, g in enumerate(found)
+    }
+
+    def place(result: Any) -> tuple[int, str]:
+        n = by_group[result.hardware_label, result.protocol_label, told_text(result.told)]
+        return n, names[n][entry_key(result)]
+
+    runs = [run_facts(source.result, *place(source.result), source.path) for source in sources]
+    for run in runs:
+        run["sheet"] = (sheets or {}).get(run["file"])
+    number = {source.result.digests.submission: n for n, source in enumerate(sources)}
+    rows = [
+        row_facts(row, *place(row["results"][0]), [number[result.digests.submission] for result in row["results"]])
+        for _, row in table.iterrows()
+    ]
+    data = {
+        "metrics": metric_facts(),
+        "columns": list(TABLE),
+        "costs": list(COSTS),
+        "qualities": list(QUALITIES),
+        "budgets": BUDGET_SECONDS,
+        "groups": [group_facts(group) for group in found],
+        "runs": runs,
+        "rows": rows,
+        "settings": distinct_settings(source.result for source in sources),
+        "paper": _paper() if with_paper else None,
+    }
+    return render(_HERE, "leaderboard.html.j2", data=data, plotly=get_plotlyjs(), counts=_counts(table, sources))
+
+
+def _counts(table: pd.DataFrame, sources: Sequence[ResultFile]) -> dict[str, int]:
+    return {
+        "results": len(sources),
+        "rows": len(table),
+        "failed": sum(source.result.status != "ok" for source in sources),
+        "scenes": len({source.result.digests.scene for source in sources}),
+        "methods": len({source.result.method for source in sources if not source.result.control}),
+    }
+
+
+def _paper() -> dict[str, Any]:
+    reported = reported_machine()
+    return {
+        "title": reported.title,
+        "entries": [
+            {"label": entry.label, "seconds": dot.seconds, "memory": dot.memory_bytes, **dot.values}
+            for entry in reported.entries
+            for dot in entry.dots
+        ],
+    }

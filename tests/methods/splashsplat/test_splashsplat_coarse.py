@@ -1,0 +1,122 @@
+"""Training targets at half their size: the same view of the same liquid, with pixels twice as large."""
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.scene.camera import Camera, look_at
+from splashbench_methods.splashsplat.appearance.coarse import with_half_size
+from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
+from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
+
+SIZE = 24
+
+
+def camera(width: int, height: int) -> Camera:
+    K = np.array([[40.0, 0, width / 2 + 1.5], [0, 44.0, height / 2 - 0.5], [0, 0, 1]])
+    return Camera("1", width, height, K, look_at([0, 0, -3.0]))
+
+
+def target(width: int = SIZE, height: int = SIZE, top: int = 4, left: int = 4, rows: int = 12, columns: int = 10):
+    """A window of [height, width] pixels whose photograph is brighter to the right, its right half liquid."""
+    ramp = torch.arange(columns, dtype=torch.float32).mul(10).expand(rows, columns)
+    mask = torch.zeros(rows, columns, dtype=torch.bool)
+    mask[:, columns // 2 :] = True
+    return TrainingTarget(
+        frame=3,
+        fraction=0.25,
+        camera=camera(width, height),
+        eye=torch.zeros(3),
+        photograph=WindowPhotograph(ramp[..., None].repeat(1, 1, 3).to(torch.uint8), mask, top, left),
+        background=torch.arange(height * width * 3, dtype=torch.float32).reshape(height, width, 3) / 1e4,
+        area=200.0,
+        hidden=torch.tensor([0, 255], dtype=torch.uint8),
+        wall=torch.ones(height, width) * torch.arange(width) / width,
+    )
+
+
+def halved(fine: TrainingTarget) -> TrainingTarget:
+    """`fine`, whose window is the whole image, at half its size."""
+    assert fine.wall is not None
+    with_half_size([fine], {"1": fine.background.numpy()}, {"1": fine.wall.numpy()})
+    assert fine.coarse is not None
+    return fine.coarse
+
+
+def test_a_point_is_seen_at_half_the_pixel() -> None:
+    fine = target(width=25, height=23)
+    coarse = halved(fine)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, size=(20, 3))
+    np.testing.assert_allclose(coarse.camera.project(points)[0], fine.camera.project(points)[0] / 2)
+    assert (coarse.camera.width, coarse.camera.height) == (13, 12)
+    assert tuple(coarse.background.shape) == (12, 13, 3)
+    assert coarse.wall is not None
+    assert tuple(coarse.wall.shape) == (12, 13)
+
+
+def test_pixels_are_means_of_four_and_a_mask_is_their_majority() -> None:
+    coarse = halved(target())
+    photograph = coarse.photograph
+    assert (photograph.top, photograph.left) == (2, 2)
+    assert photograph.image[0, :, 0].tolist() == [5, 25, 45, 65, 85]
+    # Columns 5 to 9 are liquid: of the third pair, 4 and 5, half is.
+    assert photograph.mask[0].tolist() == [False, False, True, True, True]
+    fine = target()
+    torch.testing.assert_close(coarse.background[3, 5], fine.background[6:8, 10:12].mean(dim=(0, 1)))
+    assert coarse.wall is not None
+    assert fine.wall is not None
+    torch.testing.assert_close(coarse.wall[3, 5], fine.wall[6:8, 10:12].mean())
+    assert (coarse.area, coarse.frame, coarse.fraction) == (50.0, 3, 0.25)
+    assert coarse.hidden is fine.hidden or torch.equal(coarse.hidden, fine.hidden)
+
+
+@pytest.mark.parametrize(("top", "left", "rows", "columns"), [(5, 4, 12, 10), (4, 5, 11, 9), (5, 5, 12, 11)])
+def test_a_box_at_an_odd_pixel_is_grown_to_even_ones(top: int, left: int, rows: int, columns: int) -> None:
+    fine = target(top=top, left=left, rows=rows, columns=columns)
+    photograph = halved(fine).photograph
+    whole, mask = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    whole[fine.photograph.box] = fine.photograph.image[..., 0].numpy()
+    mask[fine.photograph.box] = fine.photograph.mask.numpy()
+    blocks = mask.reshape(SIZE // 2, 2, SIZE // 2, 2).mean(axis=(1, 3))
+    found = np.zeros((SIZE // 2, SIZE // 2), bool)
+    found[photograph.box] = photograph.mask.numpy()
+    np.testing.assert_array_equal(found, blocks >= 0.5)
+    # Where the box holds all four, the image is their mean.
+    means = whole.reshape(SIZE // 2, 2, SIZE // 2, 2).mean(axis=(1, 3))
+    inner = tuple(slice(side.start + 1, side.stop - 1) for side in photograph.box)
+    np.testing.assert_allclose(photograph.image[1:-1, 1:-1, 0].numpy(), means[inner], atol=0.51)
+    assert photograph.image.is_contiguous()
+    assert photograph.mask.is_contiguous()
+
+
+def test_windows_of_one_image_share_its_half() -> None:
+    whole = np.random.default_rng(1).random((31, 40, 3)).astype(np.float32)
+    wall = np.random.default_rng(2).random((31, 40)).astype(np.float32)
+    targets = []
+    for x, y in ((2, 4), (10, 0)):
+        made = target(width=20, height=21 if y else 23)
+        made.corner = (x, y)
+        made.background = torch.from_numpy(whole)[y : y + made.camera.height, x : x + 20]
+        targets.append(made)
+    with_half_size(targets, {"1": whole}, {"1": wall})
+    storages = set()
+    for made in targets:
+        coarse = made.coarse
+        assert coarse is not None
+        assert coarse.wall is not None
+        x, y = made.corner
+        assert tuple(coarse.background.shape) == (coarse.camera.height, coarse.camera.width, 3)
+        block = whole[y + 2 : y + 4, x + 6 : x + 8].mean(axis=(0, 1))
+        np.testing.assert_allclose(coarse.background[1, 3].numpy(), block, rtol=1e-6)
+        np.testing.assert_allclose(float(coarse.wall[1, 3]), wall[y + 2 : y + 4, x + 6 : x + 8].mean(), rtol=1e-6)
+        storages.add(coarse.background.untyped_storage().data_ptr())
+    assert len(storages) == 1
+
+
+def test_a_colour_behind_everything_stays_one() -> None:
+    made = target()
+    made.background = torch.tensor([0.1, 0.2, 0.3])
+    with_half_size([made], {"1": np.array([0.1, 0.2, 0.3], np.float32)}, {"1": None})
+    assert made.coarse is not None
+    assert made.coarse.background.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert made.coarse.wall is None
