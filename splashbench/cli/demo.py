@@ -194,7 +194,7 @@ def _summary(out: Path, gates: list[_Gate], seconds: float) -> str:
             "",
             "look at",
             f"  {out / 'contact_sheet.png'}    truth, renders and foreground opacity at the test views",
-            f"  {out / 'leaderboard'}    leaderboard.md, leaderboard.csv and the speed-against-accuracy chart",
+            f"  {out / 'leaderboard' / 'index.html'}    the figures as a page, with charts; tables lie beside it",
             f"  {out / 'scene' / 'prepare_report.html'}    how the recording became a scene, with every check",
             "",
         ]

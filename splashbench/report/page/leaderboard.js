@@ -46,7 +46,7 @@ function layout(more) {
 const CONFIG = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["select2d", "lasso2d"] };
 function timeTicks(low, high) {
   const at = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 36000].filter(t => t >= low * .7 && t <= high * 1.4);
-  return { tickvals: at, ticktext: at.map(seconds) };
+  return at.length < 2 ? {} : { tickvals: at, ticktext: at.map(seconds) };
 }
 
 const group = () => data.groups[+byId("group").value];
@@ -241,7 +241,7 @@ function drawRows() {
     const first = element("td"), open = element("button", row.scene, { title: `scene ${row.digest}` });
     first.append(open);
     line.append(first);
-    for (const [name] of COLUMNS.slice(1)) line.append(element("td", data.columns.includes(name) ? (row.cells[name] || [0, "–"])[1] : row[name], data.columns.includes(name) ? {} : { class: "text" }));
+    for (const [name] of COLUMNS.slice(1)) line.append(element("td", data.columns.includes(name) ? (row.cells[name] || [0, "–"])[1] : row[name], data.columns.includes(name) ? {} : name === "told" ? { class: "text told", title: row.told } : { class: "text" }));
     line.addEventListener("click", () => show(row.runs, row));
     return line;
   }));
@@ -297,8 +297,9 @@ function drawGroup() {
   drawCards(); drawAnytime(); drawCost(); drawChases(); drawSummary();
 }
 fill(byId("group"), data.groups.map((g, n) => [n, `${g.machine} · protocol ${g.protocol} · told: ${g.told}`]), "0");
-const first = data.groups.findIndex(g => g.entries.length);
-byId("group").value = String(Math.max(0, first));
+// The group with the most runs comes first to the eye.
+const runsOf = g => g.entries.reduce((sum, label) => sum + g.estimates[label].runs, 0);
+byId("group").value = String(data.groups.reduce((best, g, n) => runsOf(g) > runsOf(data.groups[best]) ? n : best, 0));
 fill(byId("anytime-metric"), ["psnr", "lpips", "miou"].map(n => [n, data.metrics[n].title]), "psnr");
 fill(byId("cost-x"), data.costs.map(n => [n, data.metrics[n].title]), "fit_seconds");
 fill(byId("cost-y"), data.qualities.map(n => [n, data.metrics[n].title]), "psnr");
