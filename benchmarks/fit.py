@@ -5,7 +5,7 @@
 
 whole      wall time of the command `splashbench run`: starting, fitting, rendering the test views, writing
 fit        wall time of the fit, what the leaderboard calls fit_seconds
-stages     parts of the fit, as the method tells them; what is missing to the fit is between them
+stages     parts of the fit, as the method tells them; some may run at the same time, and some lies between them
 peak       largest resident memory of the process tree, GiB
 
 Runs follow one another; other load on the machine is in every time, and the load average at each run's start is noted.

@@ -25,15 +25,15 @@ from .carriers.subframe import CarrierState
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import metric_gravity
 from .model import Liquid
-from .reconstruction import Reconstruction, fit_liquid
+from .reconstruction import Reconstruction, fit_liquid, trace_liquid
 from .settings import VERSION, SplashSplatConfig
 
 if TYPE_CHECKING:
     from ..scaffold_gs import Background
 
 MIN_VIEWS = 2
-# Share of the time that the background takes, for the progress bar only.
-_BACKGROUND = 0.25
+# Share of the time that everything before the appearance takes, for the progress bar only.
+_BEFORE = 0.35
 
 
 class FittedSplashSplat(Fitted):
@@ -143,13 +143,19 @@ class SplashSplat(Method):
         return Support(True)
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
-        """Background, observation fields, carriers, appearance, in that order."""
+        """Background beside observation fields and carriers, which do not need it; then the appearance."""
         from ..scaffold_gs import shared_background
 
         if config.variant == "flip":
             metric_gravity(scene)  # an error now rather than after the background
-        with run.stage("background"), one_torch_thread():
-            background = shared_background(scene, config.background, run, span=(0, _BACKGROUND))
+
+        def fit_background(part: Run) -> Background:
+            with part.stage("background"), one_torch_thread():
+                return shared_background(scene, config.background, part)
+
+        background, traced = run.side_by_side(
+            fit_background, lambda part: trace_liquid(scene, config, part), span=(0, _BEFORE)
+        )
         frozen: dict[str, Frozen] | None = None
         if config.composition == "together":
             behind = dict.fromkeys(scene.train, background.far_color)
@@ -167,7 +173,7 @@ class SplashSplat(Method):
         def fitted(liquid: Liquid, occlusion: LiquidOcclusion | None) -> FittedSplashSplat:
             return FittedSplashSplat(liquid, background, occlusion)
 
-        return fitted(*fit_liquid(scene, behind, config, run, span=(_BACKGROUND, 1), frozen=frozen, offer=offer))
+        return fitted(*fit_liquid(scene, behind, traced, run, span=(_BEFORE, 1), frozen=frozen, offer=offer))
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""

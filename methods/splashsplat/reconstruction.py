@@ -38,40 +38,49 @@ Report = Callable[[float, str], None]
 #: The liquid, and what hides it from cameras.
 Reconstruction = tuple[Liquid, LiquidOcclusion | None]
 
-# Share of the time that everything before the appearance takes, for the progress bar only.
-_TRACKING = 0.25
 # A carrier is seen through at most this many shells of liquid.
 _SEEN_THROUGH = 1.5
+
+
+@dataclass(frozen=True)
+class Traced:
+    """The liquid before its appearance: what was observed, carriers through all frames in the precision of the files,
+    what moved them, and the packed phi_t (int8 [T, nx, ny, nz]). config: with what the observations decide."""
+
+    observations: Observations
+    carriers: Carriers
+    motion: Motion
+    packed: np.ndarray
+    config: SplashSplatConfig
+
+
+def trace_liquid(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> Traced:
+    """Observe the liquid of `scene` and follow it; needs no background."""
+    observations = observe(scene, config.fields, run, run.progress)
+    if observations.in_transparent_container:
+        config = config.in_transparent_container()
+        run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
+    carriers, motion, packed = _track(observations, scene, config, run, run.progress)
+    return Traced(observations, store_precision(carriers, observations.grid), motion, packed, config)
 
 
 def fit_liquid(
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],
-    config: SplashSplatConfig,
+    traced: Traced,
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
     frozen: Mapping[str, Frozen] | None = None,
     offer: Callable[[Callable[[], Reconstruction]], None] | None = None,
 ) -> Reconstruction:
-    """Reconstruct the liquid of `scene`; and what hides it from cameras.
+    """Fit the appearance of the liquid of `scene`; returns it, and what hides it from cameras.
 
     backgrounds: float32 [H, W, 3] of every training view, in [0, 1]; or [3] where `frozen` has the background's
     Gaussians of every view, to be drawn together with the liquid's. span: the part of `run`'s progress this takes up.
     offer: is given, after every iteration of the appearance, what makes the reconstruction as if the fit ended there.
     """
-
-    def report(fraction: float, message: str) -> None:
-        run.progress(span[0] + (span[1] - span[0]) * fraction, message)
-
-    def report_tracking(fraction: float, message: str) -> None:
-        report(_TRACKING * fraction, message)
-
-    observations = observe(scene, config.fields, run, report_tracking)
-    if observations.in_transparent_container:
-        config = config.in_transparent_container()
-        run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
-    carriers, motion, packed = _track(observations, scene, config, run, report_tracking)
-    carriers = store_precision(carriers, observations.grid)
+    config, observations, carriers = traced.config, traced.observations, traced.carriers
+    motion, packed = traced.motion, traced.packed
     occlusion = observations.occlusion
     if occlusion is not None and frozen is not None:
         occlusion = occlusion.uncut()  # the background's Gaussians hide what is behind them themselves
@@ -109,7 +118,7 @@ def fit_liquid(
             frozen,
             config,
             run.seed,
-            lambda done: report(_TRACKING + (1 - _TRACKING) * done, "appearance"),
+            lambda done: run.progress(span[0] + (span[1] - span[0]) * done, "appearance"),
             offer_state,
         )
         return reconstruction(appearance, left)

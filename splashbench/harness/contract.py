@@ -24,6 +24,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
 
 T = TypeVar("T")
+U = TypeVar("U")
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,23 @@ class Run:
         """
         if self._checkpoints is not None:
             self._overhead_seconds += self._checkpoints.offer(state)
+
+    def side_by_side(
+        self, first: Callable[[Run], T], second: Callable[[Run], U], span: tuple[float, float] = (0.0, 1.0)
+    ) -> tuple[T, U]:
+        """What two parts of the fit that do not need each other return, made at the same time where there are cores.
+
+        Args:
+            first, second: each is given a `Run` of its own, with all of the progress to itself. `second` runs in a
+                thread. Their kernels have to release the GIL, and what is drawn from torch's global generator has to be
+                drawn in one of them alone.
+            span: the part of this run's progress that both take up.
+
+        Where one raises, the other ends at its next report of progress.
+        """
+        from splashbench.harness.side_by_side import side_by_side
+
+        return side_by_side(self, first, second, span)
 
     def reuse(
         self,

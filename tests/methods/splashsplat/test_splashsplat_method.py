@@ -19,7 +19,7 @@ from splashbench_methods.splashsplat.appearance.targets import collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import locate
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.motion.velocity import control_shape
-from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
 
 TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
 
@@ -34,7 +34,8 @@ def liquid_only(scene: Scene, seed: int = 1, **overrides: object) -> Liquid:
     training = scene.training()
     grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
     config = SplashSplatConfig.preset("quick", TINY | {"iterations": 10} | overrides)
-    return fit_liquid(training, grey, config, Run(seed=seed))[0]
+    run = Run(seed=seed)
+    return fit_liquid(training, grey, trace_liquid(training, config, run), run)[0]
 
 
 def test_it_beats_its_own_background_at_the_test_views(balls: Scene, fitted: FittedSplashSplat):

@@ -17,7 +17,7 @@ from splashbench.synth.balls import ball_centers
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.fields.occlusion import LiquidOcclusion
 from splashbench_methods.splashsplat.model import Liquid
-from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
 
 RADII = np.array([0.10, 0.08, 0.06])  # of the balls, metres
 TINY = {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 12}
@@ -38,7 +38,8 @@ def fit(directory: Path, preset: str = "quick", **settings: object) -> FittedSpl
     config = SplashSplatConfig.preset(preset, TINY | settings)
     scene = Scene.open(directory).training()
     images = {name: Grey().render(camera) for name, camera in scene.cameras.items()}
-    return as_fitted(*fit_liquid(scene, images, config, Run(seed=0)))
+    run = Run(seed=0)
+    return as_fitted(*fit_liquid(scene, images, trace_liquid(scene, config, run), run))
 
 
 def set_masks(directory: Path, value: int, cameras: tuple[str, ...], frames: range) -> None:

@@ -16,7 +16,7 @@ from splashbench_methods.splashsplat.appearance.schedule import (
     Schedule,
     withheld,
 )
-from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
 from splashbench_methods.splashsplat.settings import SplashSplatConfig
 
 TINY = {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "ssim_every": 4}
@@ -107,7 +107,8 @@ def fitted(scene: Scene, **overrides: object) -> list[float]:
         if message == "appearance":
             told.append(fraction)
 
-    fit_liquid(training, grey, config, Run(seed=1, _report=note))
+    run = Run(seed=1, _report=note)
+    fit_liquid(training, grey, trace_liquid(training, config, run), run)
     return told
 
 
