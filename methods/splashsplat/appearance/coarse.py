@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 from splashbench.scene.camera import Camera
 
 from ..kernel.window_loss import WindowPhotograph
+from .photographs import read_now
 from .targets import TrainingTarget
 
 
@@ -41,7 +42,7 @@ def half_size(target: TrainingTarget, background: Tensor, wall: Tensor | None) -
 
     background, wall: of the whole image at that size, or [3] and None.
     """
-    photograph, camera = target.photograph, _half(target.camera)
+    photograph, camera = read_now(target.photograph), _half(target.camera)
     rows, columns = photograph.mask.shape
     top, left = photograph.top % 2, photograph.left % 2
     # Coarse pixels begin at even ones of the window; what is added at the edges repeats them, and is no liquid.

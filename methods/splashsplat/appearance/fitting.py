@@ -20,12 +20,13 @@ from splashbench.render import Frozen, rasterize
 from splashbench.scene.camera import Camera
 
 from ..carriers.subframe import Track
-from ..kernel.window_loss import window_losses
+from ..kernel.window_loss import WindowPhotograph, window_losses
 from . import losses
 from .active import Active, ActiveCarriers
 from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .optimizer import RowAdam
+from .photographs import ReadAhead, read_now
 from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
 from .shared_features import SharedFeatures
 from .targets import TrainingTarget
@@ -165,14 +166,22 @@ def _behind_wall(
 
 
 def image_loss(
-    image: Tensor, alpha: Tensor, target: TrainingTarget, weights: losses.LossWeights, ssim_weight: float
+    image: Tensor,
+    alpha: Tensor,
+    photograph: WindowPhotograph,
+    area: float,
+    weights: losses.LossWeights,
+    ssim_weight: float,
 ) -> Tensor:
-    """The weighted sum of the terms that compare images (Eq. total_loss); `ssim_weight` replaces weights.ssim."""
-    foreground, gradient, silhouette = window_losses(image, alpha, target.photograph)
-    loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / target.area
+    """The weighted sum of the terms that compare images (Eq. total_loss); `ssim_weight` replaces weights.ssim.
+
+    area: pixels over which the silhouette term averages.
+    """
+    foreground, gradient, silhouette = window_losses(image, alpha, photograph)
+    loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / area
     if ssim_weight > 0:
-        truth = target.photograph.image.to(torch.float32) / 255
-        loss = loss + ssim_weight * losses.ssim_loss(image[target.photograph.box], truth)
+        truth = photograph.image.to(torch.float32) / 255
+        loss = loss + ssim_weight * losses.ssim_loss(image[photograph.box], truth)
     return loss
 
 
@@ -249,7 +258,7 @@ def fit_appearance(
             target = targets[number]
             active = carriers.of(target)
             image, alpha, _ = seen(target, active, learned(target.frame, active), penalised=False)
-            total += float(image_loss(image, alpha, target, weights, weights.ssim))
+            total += float(image_loss(image, alpha, read_now(target.photograph), target.area, weights, weights.ssim))
         return total / int(withheld_targets.sum())
 
     @torch.no_grad()
@@ -268,6 +277,12 @@ def fit_appearance(
     def state() -> tuple[Appearance, np.ndarray]:
         return Appearance(features.all(), appearance.log_scales, decoder), carriers.left(track.carriers.count)
 
+    def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
+        """`target` in the size that it has at `iteration`."""
+        early = iteration < settings.coarse_share * settings.iterations
+        return target.coarse if early and target.coarse is not None else target
+
+    reader = ReadAhead()
     prunings = {round(share * settings.iterations) for share in _PRUNINGS}
     focusings = {round(share * settings.iterations) for share in _FOCUSINGS}
     queue: list[int] = []
@@ -291,13 +306,15 @@ def fit_appearance(
         target = targets[queue.pop()]
         active = carriers.of(target)
         values = [table.requires_grad_() for table in learned(target.frame, active)]
-        if target.coarse is not None and iteration < settings.coarse_share * settings.iterations:
-            target = target.coarse
+        target = sized(target, iteration)
+        photograph = reader.get(target.photograph)
+        if queue:
+            reader.prepare(sized(targets[queue[-1]], iteration + 1).photograph)
         image, alpha, penalty_terms = seen(target, active, values, penalised=True)
         assert penalty_terms is not None
         with_ssim = iteration % settings.ssim_every == 0
         ssim_weight = settings.weights.ssim * settings.ssim_every if with_ssim else 0.0
-        loss = image_loss(image, alpha, target, settings.weights, ssim_weight)
+        loss = image_loss(image, alpha, photograph, target.area, settings.weights, ssim_weight)
         loss = loss + penalty_loss(penalty_terms, track.grid.voxel, settings.weights)
         history.append(float(loss.detach()))
         if not math.isfinite(history[-1]):
@@ -316,6 +333,7 @@ def fit_appearance(
         progress(schedule.done(iteration))
         if offer is not None:
             offer(state)
+    reader.close()
     appearance.features = features.all()
     return Fit(history, carriers.left(track.carriers.count))
 

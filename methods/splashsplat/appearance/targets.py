@@ -23,6 +23,7 @@ from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import WindowPhotograph
+from .photographs import Photograph, Shelf
 
 SilhouetteNorm = Literal["image", "window", "mask"]
 
@@ -39,9 +40,9 @@ class TrainingTarget:
 
     frame, fraction: whose carriers explain it, and how long after the frame it was taken; see `locate`. camera: of the
     window, [h, w] pixels. corner: x and y of the window's first pixel in the image. photograph: image and mask of the
-    mask's padded bounding box, the only ones kept. background: float32 [h, w, 3] or [3] in [0, 1], what lies behind all
-    Gaussians. area: pixels over which the silhouette term averages. hidden: uint8 [n], by how many 255ths the container
-    hides each carrier of the frame from the view, or None.
+    mask's padded bounding box, kept or read anew (photographs.py). background: float32 [h, w, 3] or [3] in [0, 1], what
+    lies behind all Gaussians. area: pixels over which the silhouette term averages. hidden: uint8 [n], by how many
+    255ths the container hides each carrier of the frame from the view, or None.
     wall: float32 [h, w], share of each pixel in which the container's near wall lies before the liquid, or None;
     in_front: bool [n], carriers of the frame that lie before the wall, or None for none.
     frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
@@ -53,7 +54,7 @@ class TrainingTarget:
     fraction: float
     camera: Camera
     eye: Tensor
-    photograph: WindowPhotograph
+    photograph: Photograph
     background: Tensor
     area: float
     hidden: Tensor | None = None
@@ -93,6 +94,18 @@ def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) 
     )
 
 
+def _photograph(
+    scene: TrainingScene, name: str, t: int, part: tuple[slice, slice], at: tuple[int, int]
+) -> WindowPhotograph:
+    """The `part` of a photograph and its mask, which begins at column and row `at` of the window."""
+    return WindowPhotograph(
+        torch.from_numpy(scene.image(name, t)[part].copy()),
+        torch.from_numpy(scene.mask(name, t)[part].copy()),
+        top=at[1],
+        left=at[0],
+    )
+
+
 def _in_bytes(shares: np.ndarray) -> Tensor:
     """Shares in [0, 1] as uint8: there is one for every carrier of every photograph."""
     return torch.from_numpy(np.rint(HIDDEN * shares).astype(np.uint8))
@@ -129,6 +142,7 @@ def collect_targets(
     over the "mask". even: windows begin at even pixels, so that half-size ones are parts of half-size images.
     """
     frozen = frozen or {}
+    shelf = Shelf()
     targets = []
     for view, name in enumerate(scene.train):
         camera = scene.cameras[name]
@@ -154,12 +168,7 @@ def collect_targets(
             if even:
                 x0, y0 = x0 - x0 % 2, y0 - y0 % 2
             part = slice(box[1], box[3]), slice(box[0], box[2])
-            photograph = WindowPhotograph(
-                torch.from_numpy(scene.image(name, t)[part].copy()),
-                torch.from_numpy(mask[part].copy()),
-                top=box[1] - y0,
-                left=box[0] - x0,
-            )
+            photograph = shelf.put(functools.partial(_photograph, scene, name, t, part, (box[0] - x0, box[1] - y0)))
             background = torch.from_numpy(backgrounds[name])
             share, in_front = (None if cut is None else cut(name, positions)) or (None, None)
             targets.append(

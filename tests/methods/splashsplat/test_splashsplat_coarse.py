@@ -6,6 +6,7 @@ import torch
 
 from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance.coarse import with_half_size
+from splashbench_methods.splashsplat.appearance.photographs import ReadAhead, Shelf, read_now
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
 
@@ -111,6 +112,37 @@ def test_windows_of_one_image_share_its_half() -> None:
         np.testing.assert_allclose(float(coarse.wall[1, 3]), wall[y + 2 : y + 4, x + 6 : x + 8].mean(), rtol=1e-6)
         storages.add(coarse.background.untyped_storage().data_ptr())
     assert len(storages) == 1
+
+
+def test_photographs_beyond_the_room_are_read_again_each_time() -> None:
+    read = []
+
+    def reading(n: int):
+        def read_one() -> WindowPhotograph:
+            read.append(n)
+            return WindowPhotograph(
+                torch.full((4, 5, 3), n, dtype=torch.uint8), torch.ones(4, 5, dtype=torch.bool), 0, 0
+            )
+
+        return read_one
+
+    # A photograph has 80 bytes: with room for 100, two are kept.
+    shelf = Shelf(room=100)
+    photographs = [shelf.put(reading(n)) for n in range(4)]
+    assert read == [0, 1]
+    reader = ReadAhead()
+    for n in (2, 0, 3, 2):
+        assert int(reader.get(photographs[n]).image[0, 0, 0]) == n
+    assert read == [0, 1, 2, 3, 2]
+    reader.prepare(photographs[3])
+    assert int(reader.get(photographs[3]).image[0, 0, 0]) == 3
+    # What was prepared and is not wanted after all does no harm.
+    reader.prepare(photographs[3])
+    assert int(reader.get(photographs[2]).image[0, 0, 0]) == 2
+    reader.prepare(photographs[0])
+    reader.close()
+    assert sorted(read[5:]) == [2, 3, 3]
+    assert int(read_now(photographs[2]).image[0, 0, 0]) == 2
 
 
 def test_a_colour_behind_everything_stays_one() -> None:
