@@ -13,6 +13,7 @@ import numpy as np
 
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
+from splashbench.native import memory
 from splashbench.observe.container import solid_distance
 from splashbench.render import Frozen
 from splashbench.scene.scene import TrainingScene
@@ -239,6 +240,7 @@ def _fit_appearance(
             name: None if occlusion is None else occlusion.cut(scene.cameras[name], nowhere) for name in scene.train
         }
         with_half_size(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
+    memory.give_back()
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
     color_cell = observations.hull_grid.voxel / voxel

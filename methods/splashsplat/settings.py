@@ -147,9 +147,9 @@ class SplashSplatConfig(MethodConfig):
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
     idle_share: float = Field(0.02, ge=0, le=0.2)
     #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
-    coarse_share: float = Field(0.6, ge=0, le=1)
+    coarse_share: float = Field(0.8, ge=0, le=1)
     #: pixels along the longest side beyond which photographs are large enough for that
-    coarse_side: PositiveInt = 1000
+    coarse_side: PositiveInt = 1500
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "quick"] = "best"
 

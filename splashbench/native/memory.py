@@ -6,6 +6,7 @@ each cleared first. An array handed out is a view of a buffer kept here; a buffe
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import sys
@@ -51,3 +52,14 @@ def empty(shape: tuple[int, ...]) -> NDArray[np.float32]:
         while len(_buffers) > 1 and sum(buffer.nbytes for buffer in _buffers) > MAX_BYTES:
             _buffers.pop(0)  # lives on for as long as somebody holds a view of it
         return fresh.reshape(shape)
+
+
+def give_back() -> None:
+    """Give what the heap holds of freed memory back to the system, where the C library can (glibc).
+
+    Once images have been freed, the heap keeps the places of later ones, and small arrays between them: after reading a
+    scene's photographs, as much again as is in use.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(ctypes.c_size_t(0))
