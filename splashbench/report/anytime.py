@@ -134,21 +134,13 @@ class Standing:
 
 
 def standings(group: Group, name: str, budgets: Sequence[float] = BUDGETS) -> list[Standing]:
-    """Rankings after each of `budgets`, among the entries that ran on every scene that any of them ran on.
-
-    Where none did, among those that ran on the most. An entry without a value in some run is left out.
-    """
+    """Rankings after each of `budgets`. An entry without a value in some run is left out."""
     higher = METRICS[name].better == "higher"
     nothing = before(group, name)
     runs = {entry.label: trajectories(group, entry, name) for entry in group.entries}
-    most = max((len({scene for scene, _ in of}) for of in runs.values()), default=0)
     found = []
     for seconds in budgets:
-        values = {
-            label: value_at(of, seconds, nothing)
-            for label, of in runs.items()
-            if of and len({scene for scene, _ in of}) == most
-        }
+        values = {label: value_at(of, seconds, nothing) for label, of in runs.items() if of}
         values = {label: of for label, of in values.items() if np.isfinite(list(of.values())).all()}
         started = {label for label in values if any(run.at(seconds) == run.at(seconds) for run in runs[label].values())}
         ranking = sorted(

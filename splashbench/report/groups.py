@@ -98,3 +98,28 @@ def labels(results: Iterable[Result]) -> dict[tuple[str, str, str], str]:
         label = method if len(presets) == 1 else f"{method} [{preset}]"
         found[method, preset, digest] = label if len(twins) == 1 else f"{label} {digest}"
     return found
+
+
+def comparable(group: Group) -> Group:
+    """The part of `group` in which every entry ran on every scene: means over other scenes could not be compared.
+
+    Of the entries with the most scenes, so many are kept that entries times common scenes is largest; of equal ones,
+    more entries. Controls are kept.
+    """
+    ordered = sorted(group.entries, key=lambda entry: (-len(entry.scenes), entry.label))
+    best: tuple[int, int, set[str]] = (0, 0, set())
+    scenes: set[str] = set()
+    for count, entry in enumerate(ordered, 1):
+        scenes = entry.scenes if count == 1 else scenes & entry.scenes
+        if (count * len(scenes), count) > best[:2]:
+            best = (count * len(scenes), count, set(scenes))
+    kept = [
+        Entry(entry.label, [result for result in entry.results if result.digests.scene in best[2]])
+        for entry in group.entries
+        if best[2] and best[2] <= entry.scenes
+    ]
+    controls = [
+        Entry(entry.label, [result for result in entry.results if result.digests.scene in best[2]])
+        for entry in group.controls
+    ]
+    return Group(group.machine, group.protocol, group.told, kept, [entry for entry in controls if entry.results])

@@ -114,15 +114,31 @@ def test_failed_runs_and_machines_are_kept_apart(results: Path) -> None:
     here = data["groups"][1]
     assert here["machine"].startswith("test processor")
     assert here["told"] == "times"
-    assert here["estimates"]["broken"]["failed"] == 1
+    # It ran on one scene of two, so that its means could not be compared.
+    assert here["left_out"] == ["broken"]
+    assert here["shared_scenes"] == ["bowl", "tank"]
     assert "another" in data["groups"][0]["machine"]
     assert [row["status"] for row in data["rows"]].count("crashed") == 1
+
+
+def test_means_are_over_scenes_that_methods_have_in_common(make_result: Any, tmp_path: Path) -> None:
+    for method, scenes in (("a", "abcd"), ("b", "abc"), ("c", "abc"), ("d", "d")):
+        for scene in scenes:
+            psnr = 20.0 + "abcd".index(scene) + "abcd".index(method) / 10
+            make_result(method, scene=scene, psnr=psnr, fit_seconds=9.0).save(tmp_path / "results")
+    make_result("a", 1, scene="a", status="timeout", reason="over 60 s").save(tmp_path / "results")
+    (here,) = data_of(page_of(tmp_path / "results"))["groups"]
+    assert (here["shared_scenes"], here["left_out"]) == (["a", "b", "c"], ["d"])
+    figures = {label: entry["figures"]["psnr"]["value"] for label, entry in here["estimates"].items()}
+    assert figures == {"a": pytest.approx(21.0), "b": pytest.approx(21.1), "c": pytest.approx(21.2)}
+    assert (here["estimates"]["a"]["runs"], here["estimates"]["a"]["failed"]) == (4, 1)
+    assert here["scenes"] == ["a", "b", "c", "d"]
 
 
 def test_who_leads_when(results: Path) -> None:
     here = data_of(page_of(results))["groups"][1]
     leaders = {s["seconds"]: [place["label"] for place in s["ranking"]] for s in here["standings"]["psnr"]}
-    # At 10 s `good` has 15 dB and `fast` is done; `slow` begins at 41 s. `broken` ran on one scene of two.
+    # At 10 s `good` has 15 dB and `fast` is done; `slow` begins at 41 s.
     assert leaders == {10: ["fast", "good"], 60: ["good", "fast", "slow"], 300: ["good", "slow", "fast"]}
     at_ten = here["standings"]["psnr"][0]
     assert at_ten["ranking"][0]["value"] == pytest.approx(22.55)

@@ -22,7 +22,7 @@ from splashbench.report.anytime import (
     hypervolumes,
     standings,
 )
-from splashbench.report.groups import Entry, Group, told_text
+from splashbench.report.groups import Entry, Group, comparable, told_text
 from splashbench.report.statistics import Estimate, estimate
 from splashbench.score.metrics import METRICS
 from splashbench.score.notation import FILTER_MARK, in_shown_unit, label, shown
@@ -51,17 +51,21 @@ def metric_facts() -> dict[str, dict[str, Any]]:
 
 
 def group_facts(group: Group) -> dict[str, Any]:
-    """A group's curves, standings, estimates and chases, all of them over all of its scenes."""
+    """A group's curves, standings and estimates, over the scenes that its entries have in common; and its chases."""
+    shared = comparable(group)
+    kept = {entry.label for entry in shared.entries}
     return {
+        "shared_scenes": list(shared.scenes.values()) if kept else [],
+        "left_out": [entry.label for entry in group.entries if entry.label not in kept],
         "machine": group.machine,
         "protocol": group.protocol,
         "told": group.told_text,
         "scenes": list(group.scenes.values()),
         "entries": [entry.label for entry in group.entries],
-        "curves": {name: [_curve(curve) for curve in curves(group, name)] for name in QUALITY},
-        "standings": {name: [_standing(name, standing) for standing in standings(group, name)] for name in QUALITY},
-        "estimates": {entry.label: _estimates(group, entry) for entry in group.entries},
-        "hypervolumes": {name: _estimate(found) for name, found in hypervolumes(group).items()},
+        "curves": {name: [_curve(curve) for curve in curves(shared, name)] for name in QUALITY},
+        "standings": {name: [_standing(name, standing) for standing in standings(shared, name)] for name in QUALITY},
+        "estimates": {entry.label: _estimates(entry) for entry in shared.entries},
+        "hypervolumes": {name: _estimate(found) for name, found in hypervolumes(shared).items()},
         "chases": {
             name: [
                 {**vars(chase), "ratio": None if math.isinf(chase.ratio) else rounded(chase.ratio)}
@@ -106,7 +110,7 @@ def _estimate(found: Estimate) -> dict[str, Any]:
     return {"value": rounded(found.value), "interval": interval}
 
 
-def _estimates(group: Group, entry: Entry) -> dict[str, Any]:
+def _estimates(entry: Entry) -> dict[str, Any]:
     """Inter-quartile mean of each metric over the entry's runs, and how many there are and failed."""
     figures: dict[str, Any] = {}
     fine = [result for result in entry.results if result.status == "ok"]
@@ -120,8 +124,6 @@ def _estimates(group: Group, entry: Entry) -> dict[str, Any]:
         "figures": figures,
         "runs": len(entry.results),
         "failed": len(entry.results) - len(fine),
-        "scenes": len(entry.scenes),
-        "of_scenes": len(group.scenes),
         "mixed": entry.first.mixed,
     }
 

@@ -51,6 +51,11 @@ function timeTicks(low, high) {
 
 const group = () => data.groups[+byId("group").value];
 
+function overScenes(chosen) {
+  const shared = chosen.shared_scenes, all = chosen.scenes.length;
+  const scenes = shared.length === all ? `${all} scene${all === 1 ? "" : "s"}` : `${shared.length} of ${all} scenes, on which all of these methods ran (${shared.join(", ")})`;
+  return scenes + (chosen.left_out.length ? `, without ${chosen.left_out.join(", ")}` : "");
+}
 function drawCards() {
   const chosen = group();
   byId("cards").replaceChildren(...data.budgets.map((budget, n) => {
@@ -75,7 +80,7 @@ function drawCards() {
     card.append(list);
     return card;
   }));
-  byId("cards-note").textContent = `Inter-quartile mean over ${chosen.scenes.length} scene${chosen.scenes.length === 1 ? "" : "s"} and all seeds, of what a method has after so much of its fit. ` +
+  byId("cards-note").textContent = `Inter-quartile mean over ${overScenes(chosen)} and all seeds, of what a method has after so much of its fit. ` +
     "A run that has nothing yet, or failed, shows what the control `nothing` does. Scenes told: " + chosen.told + ".";
 }
 
@@ -106,18 +111,18 @@ function drawAnytime() {
   const xs = traces.flatMap(t => t.x), better = data.metrics[name].better === "higher" ? "higher is better →" : "← lower is better";
   Plotly.react("anytime", traces, layout({ xaxis: { type: "log", title: { text: "seconds of fitting (log scale)" }, ...timeTicks(Math.min(...xs), Math.max(...xs)) },
     yaxis: { title: { text: `${data.metrics[name].label}, ${better}` } } }), CONFIG).then(openPoint);
-  const without = chosen.entries.filter(label => !traces.some(t => t.legendgroup === label));
+  const without = chosen.entries.filter(label => !chosen.left_out.includes(label) && !traces.some(t => t.legendgroup === label));
   byId("anytime-note").textContent = traces.length
-    ? "A line begins where every run has a value, and ends with the longest fit. " + (scene === ALL ? "Bands: 95% intervals. " : "A line per seed; marks are checkpoints, the last one the end. ") + (without.length ? `Not drawn for want of figures: ${without.join(", ")}.` : "")
+    ? "A line begins where every run has a value, and ends with the longest fit. " + (scene === ALL ? `Bands: 95% intervals. Over ${overScenes(chosen)}. ` : "A line per seed; marks are checkpoints, the last one the end. ") + (without.length ? `Not drawn for want of figures: ${without.join(", ")}.` : "")
     : "No run has this figure and a fit time.";
 }
 
 function points(x, y, scene) {
   const number = +byId("group").value, chosen = group();
-  if (scene === ALL) return chosen.entries.flatMap(label => {
-    const { figures, runs, failed, scenes, of_scenes } = chosen.estimates[label];
+  if (scene === ALL) return Object.keys(chosen.estimates).flatMap(label => {
+    const { figures, runs, failed } = chosen.estimates[label];
     if (!(x in figures) || !(y in figures)) return [];
-    const note = `${runs} runs` + (failed ? `, ${failed} failed` : "") + (scenes < of_scenes ? `, ${scenes} of ${of_scenes} scenes` : "");
+    const note = `${runs} runs` + (failed ? `, ${failed} failed` : "");
     return [{ label, x: figures[x], y: figures[y], note, run: data.runs.findIndex(r => r.group === number && r.label === label) }];
   });
   const found = new Map();
@@ -154,7 +159,7 @@ function drawCost() {
     yaxis: { title: { text: data.metrics[y].label } } }), CONFIG).then(openPoint);
   const filtered = data.metrics[y].filtered ? found.filter(p => (group().estimates[p.label] || {}).mixed).map(p => p.label) : [];
   byId("cost-note").textContent = found.length
-    ? (scene === ALL ? "Inter-quartile means with 95% intervals. " : "Medians over seeds, from the least to the largest. ") + "A click opens a run." + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
+    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + "A click opens a run." + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
     : "No run has both figures.";
 }
 
@@ -194,7 +199,8 @@ function drawChases() {
 
 function drawSummary() {
   const chosen = group(), names = ["psnr", "lpips", "miou", "spill", "jitter_error", "fit_seconds", "peak_memory_bytes", "storage_bytes", "render_fps"];
-  const shown = names.filter(name => chosen.entries.some(label => name in chosen.estimates[label].figures));
+  const kept = chosen.entries.filter(label => label in chosen.estimates);
+  const shown = names.filter(name => kept.some(label => name in chosen.estimates[label].figures));
   const head = element("tr");
   head.append(element("th", "method"), element("th", "runs"), ...shown.map(name => element("th", data.metrics[name].label)), element("th", "hypervolume"));
   const cell = (found, digits) => {
@@ -202,10 +208,10 @@ function drawSummary() {
     if (found && found.interval) made.append(element("small", `${number(found.interval[0], digits)} to ${number(found.interval[1], digits)}`));
     return made;
   };
-  byId("summary").replaceChildren(head, ...chosen.entries.map(label => {
-    const { figures, runs, failed, scenes, of_scenes, mixed } = chosen.estimates[label], row = element("tr");
+  byId("summary-note").textContent = `Over ${overScenes(chosen)}.`;
+  byId("summary").replaceChildren(head, ...kept.map(label => {
+    const { figures, runs, failed, mixed } = chosen.estimates[label], row = element("tr");
     const count = element("td", `${runs}` + (failed ? `, ${failed} failed` : ""));
-    if (scenes < of_scenes) count.append(element("small", `${scenes} of ${of_scenes} scenes`));
     row.append(element("th", label + (mixed ? " †" : ""), { scope: "row" }), count);
     for (const name of shown) row.append(cell(figures[name], { psnr: 2, lpips: 4, miou: 3, spill: 3, jitter_error: 4, fit_seconds: 0, peak_memory_bytes: 0, storage_bytes: 1, render_fps: 1 }[name]));
     row.append(cell(chosen.hypervolumes[label], 3));
@@ -298,7 +304,7 @@ function drawGroup() {
 }
 fill(byId("group"), data.groups.map((g, n) => [n, `${g.machine} · protocol ${g.protocol} · told: ${g.told}`]), "0");
 // The group with the most runs comes first to the eye.
-const runsOf = g => g.entries.reduce((sum, label) => sum + g.estimates[label].runs, 0);
+const runsOf = g => Object.values(g.estimates).reduce((sum, entry) => sum + entry.runs, 0);
 byId("group").value = String(data.groups.reduce((best, g, n) => runsOf(g) > runsOf(data.groups[best]) ? n : best, 0));
 fill(byId("anytime-metric"), ["psnr", "lpips", "miou"].map(n => [n, data.metrics[n].title]), "psnr");
 fill(byId("cost-x"), data.costs.map(n => [n, data.metrics[n].title]), "fit_seconds");
