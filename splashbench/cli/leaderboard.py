@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.report.leaderboard import write_leaderboard
     from splashbench.report.page import PAGE, leaderboard_page
     from splashbench.report.results import load_results
-    from splashbench.report.table import leaderboard_table
+    from splashbench.report.table import leaderboard_table, to_csv
 
     sources = load_results(arguments.results)
     table = leaderboard_table(sources)
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         write_text(page, leaderboard_page(table, sources, arguments.with_paper, _sheets(table, sources, arguments)))
         paths.insert(0, page)
     files = [arguments.out / path.name for path in paths]
-    changed = [] if before is None else changes(before, _text(arguments.out / "leaderboard.csv") or "")
+    changed = [] if before is None else changes(before, to_csv(table))
     failed = int(table["failed"].sum())
     say(f"{len(sources)} results, {len(table)} rows{f', {failed} of them failed runs' if failed else ''}")
     for file in files:
@@ -99,11 +99,11 @@ def _sheets(table: pd.DataFrame, sources: Sequence[ResultFile], arguments: argpa
     from splashbench.report.result_sheet import embedded_sheet
 
     root = arguments.results.parent if arguments.results.is_file() else arguments.results
-    paths = {source.result.digests.submission: source.path for source in sources}
+    paths = {id(source.result): source.path for source in sources}
     sheets: dict[str, str] = {}
     room = _MAX_SHEETS_BYTES
     for results in table["results"]:
-        path = paths[results[0].digests.submission]
+        path = paths[id(results[0])]
         sheet = embedded_sheet(root / path)
         if sheet is not None and len(sheet) <= room:
             sheets[path] = sheet

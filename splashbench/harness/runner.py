@@ -339,5 +339,18 @@ def override_texts(settings: Mapping[str, Any], parent: str = "") -> list[str]:
         if isinstance(value, Mapping) and value:
             texts += override_texts(value, f"{parent}{key}.")
         else:
-            texts.append(f"{parent}{key}={value if isinstance(value, str) else json.dumps(value, default=str)}")
+            texts.append(f"{parent}{key}={value if _is_text(value) else json.dumps(value, default=str)}")
     return texts
+
+
+def _is_text(value: Any) -> bool:
+    """Whether `value` is a string that `parse_overrides` would leave one."""
+    import json
+
+    if not isinstance(value, str):
+        return False
+    try:
+        json.loads(value)
+    except (ValueError, RecursionError):
+        return True
+    return False

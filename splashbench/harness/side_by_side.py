@@ -1,7 +1,7 @@
 """Two parts of a fit that do not need each other, made at the same time on two cores.
 
 Each part has a `Run` of its own, so that what it reuses, notes and counts as stages is told apart. The fit's time is
-then what it would have been without reuse: the longer part's.
+then the longer part's. With a part that was reused, the other one had the cores to itself and takes a little less.
 """
 
 from __future__ import annotations

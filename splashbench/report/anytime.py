@@ -42,7 +42,7 @@ def trajectory(result: Result, name: str, failed_after: float) -> Trajectory | N
     if result.status != "ok":
         return Trajectory((), (), failed_after)
     end, seconds = result.value(name), result.value("fit_seconds")
-    if end is None or seconds is None:
+    if end is None or not seconds:
         return None
     states = [(c.seconds, c.metrics[name]) for c in result.checkpoints if c.metrics.get(name) is not None]
     states = [*(state for state in states if state[0] <= seconds), (seconds, end)]
@@ -110,7 +110,8 @@ def curves(group: Group, name: str) -> list[Curve]:
     nothing, steps, found = before(group, name), grid(group), []
     for entry in group.entries:
         runs = trajectories(group, entry, name)
-        if not any(run.seconds for run in runs.values()):
+        # Of an entry that lacks the figure in some runs the rest would be over other scenes.
+        if len(runs) < len(entry.results) or not any(run.seconds for run in runs.values()):
             continue
         last = max(run.spent() for run in runs.values())
         points = []
@@ -134,10 +135,11 @@ class Standing:
 
 
 def standings(group: Group, name: str, budgets: Sequence[float] = BUDGETS) -> list[Standing]:
-    """Rankings after each of `budgets`. An entry without a value in some run is left out."""
+    """Rankings after each of `budgets`. An entry that lacks the figure in some run is left out."""
     higher = METRICS[name].better == "higher"
     nothing = before(group, name)
     runs = {entry.label: trajectories(group, entry, name) for entry in group.entries}
+    runs = {entry.label: runs[entry.label] for entry in group.entries if len(runs[entry.label]) == len(entry.results)}
     found = []
     for seconds in budgets:
         values = {label: value_at(of, seconds, nothing) for label, of in runs.items() if of}

@@ -17,15 +17,28 @@ _SHOWN = 20
 def changes(before: str, after: str) -> list[str]:
     """A line per row that differs between two leaderboards as CSV text; none where they say the same.
 
-    A method whose version or settings changed is the same row with other figures.
+    Of rows with one name, those with the same settings are one row; of the others, one after the other. So a method
+    whose version or settings changed is the same row with other figures. A `before` that is no CSV has no rows.
     """
-    old, new = (_rows(text) for text in (before, after))
-    lines = [f"gone: {_name(key)}" for key in old if key not in new]
-    lines += [f"new: {_name(key)}" for key in new if key not in old]
-    for key in new:
-        if key in old:
-            lines += _differences(_name(key), old[key], new[key])
-    return lines
+    try:
+        old = _rows(before)
+    except csv.Error:
+        old = {}
+    new = _rows(after)
+    gone, came, changed = [], [], []
+    for key in [*old, *(key for key in new if key not in old)]:
+        was, now = list(old.get(key, [])), list(new.get(key, []))
+        pairs = [(a, b) for a in was for b in now if a.get("settings_digest") == b.get("settings_digest")]
+        for a, b in pairs:
+            if a in was and b in now:
+                was.remove(a)
+                now.remove(b)
+                changed += _differences(_name(key), a, b)
+        for a, b in zip(was, now):
+            changed += _differences(_name(key), a, b)
+        gone += [f"gone: {_name(key)}" for _ in was[len(now) :]]
+        came += [f"new: {_name(key)}" for _ in now[len(was) :]]
+    return [*gone, *came, *changed]
 
 
 def shortened(lines: Iterable[str]) -> list[str]:
@@ -35,15 +48,12 @@ def shortened(lines: Iterable[str]) -> list[str]:
     return lines if more <= 0 else [*lines[:_SHOWN], f"and {more} more"]
 
 
-def _rows(text: str) -> dict[tuple[str, ...], dict[str, str]]:
-    """Rows by their names; of several with one name, the n-th has n behind it."""
-    found: dict[tuple[str, ...], dict[str, str]] = {}
+def _rows(text: str) -> dict[tuple[str, ...], list[dict[str, str]]]:
+    """Rows by their names."""
+    found: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    csv.field_size_limit(1 << 24)  # a failed run's reason may be long
     for row in csv.DictReader(io.StringIO(text)):
-        key = tuple(row.get(name) or "" for name in _NAMES)
-        number = 1
-        while (*key, str(number)) in found:
-            number += 1
-        found[(*key, str(number))] = row
+        found.setdefault(tuple(row.get(name) or "" for name in _NAMES), []).append(row)
     return found
 
 

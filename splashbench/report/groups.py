@@ -74,12 +74,12 @@ def groups(sources: Sequence[ResultFile]) -> list[Group]:
 def _group(results: list[Result]) -> Group:
     group = Group(results[0].hardware_label, results[0].protocol_label, results[0].told)
     names = labels(results)
-    entries: dict[str, Entry] = {}
+    entries: dict[tuple[str, str, str], Entry] = {}
     for result in sorted(results, key=lambda r: (r.scene, r.digests.scene, r.seed, r.digests.submission)):
-        label = names[entry_key(result)]
-        entries.setdefault(label, Entry(label)).results.append(result)
-    for label in sorted(entries):
-        (group.controls if entries[label].first.control else group.entries).append(entries[label])
+        key = entry_key(result)
+        entries.setdefault(key, Entry(names[key])).results.append(result)
+    for entry in sorted(entries.values(), key=lambda entry: entry.label):
+        (group.controls if entry.first.control else group.entries).append(entry)
     return group
 
 
@@ -97,29 +97,32 @@ def labels(results: Iterable[Result]) -> dict[tuple[str, str, str], str]:
         twins = {key for key in keys if key[:2] == (method, preset)}
         label = method if len(presets) == 1 else f"{method} [{preset}]"
         found[method, preset, digest] = label if len(twins) == 1 else f"{label} {digest}"
-    return found
+    taken = list(found.values())
+    # A method may be called what another one is labelled.
+    return {key: label if taken.count(label) == 1 else f"{label} {key[2]}" for key, label in found.items()}
 
 
 def comparable(group: Group) -> Group:
     """The part of `group` in which every entry ran on every scene: means over other scenes could not be compared.
 
-    Of the entries with the most scenes, so many are kept that entries times common scenes is largest; of equal ones,
-    more entries. Controls are kept.
+    The scenes are those of one entry, or common to two, for which the number of entries that ran on all of them times
+    the number of scenes is largest. Controls are kept.
     """
-    ordered = sorted(group.entries, key=lambda entry: (-len(entry.scenes), entry.label))
-    best: tuple[int, int, set[str]] = (0, 0, set())
-    scenes: set[str] = set()
-    for count, entry in enumerate(ordered, 1):
-        scenes = entry.scenes if count == 1 else scenes & entry.scenes
-        if (count * len(scenes), count) > best[:2]:
-            best = (count * len(scenes), count, set(scenes))
+    sets = [entry.scenes for entry in group.entries]
+    candidates = {frozenset(a & b) for a in sets for b in sets}
+
+    def worth(scenes: frozenset[str]) -> tuple[int, int, list[str]]:
+        count = sum(scenes <= entry.scenes for entry in group.entries) if scenes else 0
+        return count * len(scenes), count, sorted(scenes)
+
+    chosen = max(candidates, key=worth, default=frozenset())
     kept = [
-        Entry(entry.label, [result for result in entry.results if result.digests.scene in best[2]])
+        Entry(entry.label, [result for result in entry.results if result.digests.scene in chosen])
         for entry in group.entries
-        if best[2] and best[2] <= entry.scenes
+        if chosen and chosen <= entry.scenes
     ]
     controls = [
-        Entry(entry.label, [result for result in entry.results if result.digests.scene in best[2]])
+        Entry(entry.label, [result for result in entry.results if result.digests.scene in chosen])
         for entry in group.controls
     ]
     return Group(group.machine, group.protocol, group.told, kept, [entry for entry in controls if entry.results])

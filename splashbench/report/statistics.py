@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 #: Resamplings of an interval; fixed, as its bytes are to depend on the results alone.
 SAMPLES = 2000
-#: Fewer runs have no interval.
-LEAST_RUNS = 3
+#: Fewer runs have no interval, and a comparison needs as many scenes: a bootstrap of less is far too narrow.
+LEAST_RUNS = 5
 _LEVEL = 95.0
 
 
@@ -166,16 +166,16 @@ def expected_running_time(runs: Sequence[Trajectory], target: float, higher_is_b
 
 @dataclass(frozen=True)
 class Comparison:
-    """`first` against `second` on the runs both have: mean difference (positive: first is better), and its interval.
+    """`first` against `second` on the scenes both have: mean difference (positive: first is better), and its interval.
 
-    probability: share of resamplings in which the first one is better. pairs: of (scene, seed).
+    probability: share of resamplings of the scenes in which the first one is better; NaN where there are too few.
     """
 
     first: str
     second: str
     difference: Estimate
     probability: float
-    pairs: int
+    scenes: int
 
 
 def compare(
@@ -185,17 +185,23 @@ def compare(
     higher_is_better: bool,
     samples: int = SAMPLES,
 ) -> Comparison | None:
-    """Paired by (scene, seed). values: method to run to value. None where they have no run in common."""
-    common = sorted(values[first].keys() & values[second].keys())
+    """Paired by scene, of means over seeds. values: method to (scene, seed) to value. None without a common scene."""
+    means = {name: _by_scene(values[name]) for name in (first, second)}
+    common = sorted(means[first].keys() & means[second].keys())
     if not common:
         return None
     sign = 1.0 if higher_is_better else -1.0
-    by_scene = [
-        np.array([sign * (values[first][key] - values[second][key]) for key in group])
-        for _, group in itertools.groupby(common, key=lambda key: key[0])
-    ]
-    found = estimate(by_scene, mean, samples)
+    differences = [np.array([sign * (means[first][scene] - means[second][scene])]) for scene in common]
+    found = estimate(differences, mean, samples)
     if found.interval is None:
         return Comparison(first, second, found, float("nan"), len(common))
-    wins = mean(resampled(by_scene, samples)) > 0
+    wins = mean(resampled(differences, samples)) > 0
     return Comparison(first, second, found, float(wins.mean()), len(common))
+
+
+def _by_scene(values: Mapping[tuple[str, int], float]) -> dict[str, float]:
+    """The mean over seeds of every scene."""
+    found: dict[str, list[float]] = {}
+    for (scene, _), value in values.items():
+        found.setdefault(scene, []).append(value)
+    return {scene: float(np.mean(of)) for scene, of in found.items()}

@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from splashbench.report.groups import told_text
 from splashbench.report.results import ResultFile
 from splashbench.score.metrics import METRICS, TRUTH_METRICS
 from splashbench.score.notation import stored
@@ -32,7 +33,7 @@ SCENE_COLUMNS = ["scene", "scene_digest", "protocol"]
 #: What names a method besides: figures of rows that differ in any of these are never averaged.
 METHOD_COLUMNS = ["method", "preset", "settings_digest", "hardware"]
 # Failed runs never share a row: each has its own submission here, where all others have "".
-_ROW_COLUMNS = [*SCENE_COLUMNS, *METHOD_COLUMNS, "failed_submission"]
+_ROW_COLUMNS = [*SCENE_COLUMNS, *METHOD_COLUMNS, "told", "failed_submission"]
 _SHARED_COLUMNS = ["status", "reason", "failed", "control", "mixed", "method_version"]
 
 
@@ -58,7 +59,7 @@ def leaderboard_table(sources: Sequence[ResultFile]) -> pd.DataFrame:
             ]
         )
     )
-    ranking = [*SCENE_COLUMNS, "failed", "lpips", "psnr", *METHOD_COLUMNS, "failed_submission"]
+    ranking = [*SCENE_COLUMNS, "failed", "lpips", "psnr", *METHOD_COLUMNS, "told", "failed_submission"]
     ascending = [column != "psnr" for column in ranking]
     return rows.reset_index().sort_values(ranking, ascending=ascending, ignore_index=True)
 
@@ -73,6 +74,7 @@ def _run(result: Result) -> dict[str, Any]:
         "preset": result.preset,
         "settings_digest": result.settings_digest,
         "hardware": result.hardware_label,
+        "told": told_text(result.told),
         "failed_submission": result.digests.submission if failed else "",
         "status": result.status,
         "reason": result.reason,

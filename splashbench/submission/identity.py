@@ -52,7 +52,7 @@ class Identity(BaseModel):
     preset: str = "best"
     settings: dict[str, Any] = Field(default_factory=dict)
     #: KEY=VALUE: settings that were given on top of the preset
-    overrides: list[Annotated[str, Field(max_length=_MAX_NOTE)]] = Field(default_factory=list, max_length=1000)
+    overrides: list[Annotated[str, Field(max_length=100_000)]] = Field(default_factory=list, max_length=1000)
     seed: int = 0
     device: str = "cpu"
     scene: str

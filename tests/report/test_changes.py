@@ -40,6 +40,19 @@ def test_new_gone_and_changed_rows_are_told(make_result: Any, before: str, tmp_p
     ]
 
 
+def test_a_new_variant_is_new_and_not_another_ones_change(make_result: Any, tmp_path: Path) -> None:
+    make_result("alpha", 0, lpips=0.2, settings={"a": 1}).save(tmp_path / "results")
+    before = csv_of(tmp_path / "results")
+    make_result("alpha", 1, lpips=0.1, settings={"a": 2}).save(tmp_path / "results")
+    assert changes(before, csv_of(tmp_path / "results")) == ["new: alpha [best] on bowl, test processor, 2 cores"]
+
+
+def test_a_very_long_reason(make_result: Any, tmp_path: Path) -> None:
+    make_result("alpha", status="crashed", reason="x" * 200_000).save(tmp_path / "results")
+    text = csv_of(tmp_path / "results")
+    assert changes(text, text) == []
+
+
 def test_many_changes_are_told_by_their_number() -> None:
     assert shortened(str(n) for n in range(25))[-2:] == ["19", "and 5 more"]
     assert shortened(["one"]) == ["one"]

@@ -18,6 +18,7 @@ from splashbench.report.results import load_results
 from splashbench.report.statistics import pareto_mask
 from splashbench.report.table import leaderboard_table
 from splashbench.score.result import CheckpointScore, Result
+from splashbench.score.settings import PROTOCOL_V1
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 CHOOSE = """
@@ -130,9 +131,56 @@ def test_means_are_over_scenes_that_methods_have_in_common(make_result: Any, tmp
     (here,) = data_of(page_of(tmp_path / "results"))["groups"]
     assert (here["shared_scenes"], here["left_out"]) == (["a", "b", "c"], ["d"])
     figures = {label: entry["figures"]["psnr"]["value"] for label, entry in here["estimates"].items()}
+    # Without the control `nothing` the run that failed cannot be charged: it is counted, and its method on no front.
     assert figures == {"a": pytest.approx(21.0), "b": pytest.approx(21.1), "c": pytest.approx(21.2)}
     assert (here["estimates"]["a"]["runs"], here["estimates"]["a"]["failed"]) == (4, 1)
     assert here["scenes"] == ["a", "b", "c", "d"]
+
+
+def test_a_failed_run_has_the_quality_of_nothing(results: Path, make_result: Any) -> None:
+    next(path for path in results.glob("good__bowl__*") if "test processor" in path.read_text()).unlink()
+    make_result("good", 7, scene="bowl", status="out_of_memory", reason="killed", told=("times",)).save(results)
+    here = data_of(page_of(results))["groups"][-1]
+    entry = here["estimates"]["good"]
+    assert entry["failed"] == 1
+    assert entry["figures"]["psnr"]["runs"] == 4
+    # Of 12, 28 or 28.1, 29 and 29.1 dB the middle two.
+    assert 28.4 < entry["figures"]["psnr"]["value"] < 28.6
+
+
+def test_odd_results_do_not_stop_the_page(make_result: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    make_result("a", fit_seconds=0.0, psnr=20.0, settings={"rate": float("nan")}).save(folder)
+    make_result("b", fit_seconds=9.0, psnr=21.0).save(folder)
+    make_result("b", 1, scene="tank", fit_seconds=9.0).save(folder)
+    make_result("constructor", scene="far", fit_seconds=9.0, psnr=3.0).save(folder)
+    path = next(folder.glob("a__*"))
+    path.write_text(path.read_text().replace('"rate": null', '"rate": NaN'))
+    data = data_of(page_of(folder))
+    assert {"rate": "NaN"} in data["settings"].values() or {"rate": None} in data["settings"].values()
+    assert len(data["rows"]) == 4
+
+
+def test_one_submission_scored_by_two_protocols_is_two_runs(make_result: Any, tmp_path: Path) -> None:
+    first: Result = make_result("a", psnr=20.0, fit_seconds=9.0)
+    changed = PROTOCOL_V1.model_copy(update={"opacity_threshold": 0.3})
+    digests = first.digests.model_copy(update={"protocol": changed.digest})
+    metrics = {**first.metrics, "psnr": first.metrics["psnr"].model_copy(update={"value": 30.0})}
+    first.save(tmp_path / "results")
+    second = first.model_copy(update={"protocol": changed, "digests": digests, "metrics": metrics})
+    second.save(tmp_path / "results")
+    data = data_of(page_of(tmp_path / "results"))
+    for row in data["rows"]:
+        (number,) = row["runs"]
+        assert data["runs"][number]["figures"]["psnr"] == row["cells"]["psnr"][0]
+        assert data["runs"][number]["group"] == row["group"]
+
+
+def test_what_scenes_told_is_never_mixed_in_a_row(make_result: Any, tmp_path: Path) -> None:
+    make_result("a", 0, psnr=20.0, told=None).save(tmp_path / "results")
+    make_result("a", 1, psnr=22.0, told=("times", "gravity")).save(tmp_path / "results")
+    rows = data_of(page_of(tmp_path / "results"))["rows"]
+    assert {(row["told"], row["cells"]["psnr"][0]) for row in rows} == {("not noted", 20.0), ("times, gravity", 22.0)}
 
 
 def test_who_leads_when(results: Path) -> None:
@@ -143,7 +191,8 @@ def test_who_leads_when(results: Path) -> None:
     at_ten = here["standings"]["psnr"][0]
     assert at_ten["ranking"][0]["value"] == pytest.approx(22.55)
     assert at_ten["lead"]["difference"]["value"] == pytest.approx(7.55)
-    assert at_ten["lead"]["pairs"] == 4
+    assert at_ten["lead"]["scenes"] == 2
+    assert at_ten["lead"]["probability"] is None
 
 
 def test_curves_begin_where_every_run_has_a_value(results: Path) -> None:

@@ -279,7 +279,7 @@ def fit_appearance(
 
     def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
         """`target` in the size that it has at `iteration`."""
-        early = iteration < settings.coarse_share * settings.iterations
+        early = schedule.done(iteration) < settings.coarse_share
         return target.coarse if early and target.coarse is not None else target
 
     reader = ReadAhead()

@@ -16,6 +16,7 @@ import pandas as pd
 from splashbench.report.anytime import (
     BUDGETS,
     QUALITY,
+    before,
     by_scene,
     chases,
     curves,
@@ -64,7 +65,7 @@ def group_facts(group: Group) -> dict[str, Any]:
         "entries": [entry.label for entry in group.entries],
         "curves": {name: [_curve(curve) for curve in curves(shared, name)] for name in QUALITY},
         "standings": {name: [_standing(name, standing) for standing in standings(shared, name)] for name in QUALITY},
-        "estimates": {entry.label: _estimates(entry) for entry in shared.entries},
+        "estimates": {entry.label: _estimates(shared, entry) for entry in shared.entries},
         "hypervolumes": {name: _estimate(found) for name, found in hypervolumes(shared).items()},
         "chases": {
             name: [
@@ -99,7 +100,7 @@ def _standing(name: str, standing: Any) -> dict[str, Any]:
         else {
             "difference": _estimate(lead.difference),
             "probability": None if math.isnan(lead.probability) else rounded(lead.probability),
-            "pairs": lead.pairs,
+            "scenes": lead.scenes,
             "text": shown(METRICS[name], lead.difference.value),
         },
     }
@@ -110,12 +111,19 @@ def _estimate(found: Estimate) -> dict[str, Any]:
     return {"value": rounded(found.value), "interval": interval}
 
 
-def _estimates(entry: Entry) -> dict[str, Any]:
-    """Inter-quartile mean of each metric over the entry's runs, and how many there are and failed."""
+def _estimates(group: Group, entry: Entry) -> dict[str, Any]:
+    """Inter-quartile mean of each metric over the entry's runs, and how many there are and failed.
+
+    A failed run has the quality that `nothing` has of its scene, where that is known, and no cost.
+    """
     figures: dict[str, Any] = {}
     fine = [result for result in entry.results if result.status == "ok"]
     for name in _SHOWN:
         values = {(r.digests.scene, r.seed): v for r in fine if (v := r.value(name)) is not None}
+        if name in QUALITY:
+            nothing = before(group, name)
+            charged = [r for r in entry.results if r.status != "ok" and r.digests.scene in nothing]
+            values |= {(r.digests.scene, r.seed): nothing[r.digests.scene] for r in charged}
         if values:
             scale = in_shown_unit(METRICS[name], 1.0)
             found = estimate([scale * part for part in by_scene(values)])
@@ -128,8 +136,11 @@ def _estimates(entry: Entry) -> dict[str, Any]:
     }
 
 
-def run_facts(result: Result, group: int, label: str, path: str) -> dict[str, Any]:
-    """One run: its figures in shown units, its course, and what its details tell. `path`: of its file."""
+def run_facts(result: Result, group: int, label: str, scene: str, path: str) -> dict[str, Any]:
+    """One run: its figures in shown units, its course, and what its details tell.
+
+    scene: its name within the group. path: of its file.
+    """
     figures = {
         name: rounded(in_shown_unit(METRICS[name], value))
         for name in _SHOWN
@@ -143,7 +154,7 @@ def run_facts(result: Result, group: int, label: str, path: str) -> dict[str, An
     return {
         "group": group,
         "label": label,
-        "scene": result.scene,
+        "scene": scene,
         "seed": result.seed,
         "status": result.status,
         "reason": result.reason,
@@ -211,7 +222,8 @@ def row_facts(row: pd.Series, group: int, label: str, runs: list[int]) -> dict[s
 def distinct_settings(results: Iterable[Result]) -> dict[str, Mapping[str, Any]]:
     """Settings by their digest: many runs share them."""
     found = {result.settings_digest: result.settings for result in results}
-    return {digest: json.loads(json.dumps(found[digest], default=str)) for digest in sorted(found)}
+    # What JSON cannot say, such as NaN in a stranger's file, becomes text.
+    return {digest: json.loads(json.dumps(found[digest], default=str), parse_constant=str) for digest in sorted(found)}
 
 
 def rounded(value: float) -> float | None:

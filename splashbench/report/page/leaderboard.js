@@ -71,9 +71,9 @@ function drawCards() {
       const lead = standing.lead;
       if (lead) {
         const second = standing.ranking[1].label, by = number(Math.abs(lead.difference.value), decimals(name));
-        const sure = lead.probability === null ? "too few runs to tell" : `ahead in ${Math.round(100 * lead.probability)} % of resamplings`;
-        cell.append(element("span", `${lead.difference.value >= 0 ? "by" : "behind on common runs by"} ${by} before ${second}: ${sure}`, { class: "sure" }));
-      } else cell.append(element("span", "no other has a state by then", { class: "sure" }));
+        const sure = lead.probability === null ? "too few scenes to tell" : `ahead in ${Math.round(100 * lead.probability)} % of resamplings`;
+        cell.append(element("span", `${lead.difference.value >= 0 ? "by" : "behind on common scenes by"} ${by} before ${second}: ${sure}`, { class: "sure" }));
+      } else cell.append(element("span", standing.ranking.length > 1 ? `no scene in common with ${standing.ranking[1].label}` : "no other has a state by then", { class: "sure" }));
       list.append(cell);
     }
     if (!list.children.length) list.append(element("dd", "no method has anything to show by then"));
@@ -112,8 +112,9 @@ function drawAnytime() {
   Plotly.react("anytime", traces, layout({ xaxis: { type: "log", title: { text: "seconds of fitting (log scale)" }, ...timeTicks(Math.min(...xs), Math.max(...xs)) },
     yaxis: { title: { text: `${data.metrics[name].label}, ${better}` } } }), CONFIG).then(openPoint);
   const without = chosen.entries.filter(label => !chosen.left_out.includes(label) && !traces.some(t => t.legendgroup === label));
+  const late = chosen.entries.filter(label => !data.runs.some(run => run.group === +byId("group").value && run.label === label && run.course.length));
   byId("anytime-note").textContent = traces.length
-    ? "A line begins where every run has a value, and ends with the longest fit. " + (scene === ALL ? `Bands: 95% intervals. Over ${overScenes(chosen)}. ` : "A line per seed; marks are checkpoints, the last one the end. ") + (without.length ? `Not drawn for want of figures: ${without.join(", ")}.` : "")
+    ? "A line begins where every run has a value, and ends with the longest fit. " + (scene === ALL ? `Bands: 95% intervals. Over ${overScenes(chosen)}. ` : "A line per seed; marks are checkpoints, the last one the end. ") + (without.length ? `Not drawn for want of figures: ${without.join(", ")}. ` : "") + (late.length ? `Without checkpoints, so that only the end is known: ${late.join(", ")}.` : "")
     : "No run has this figure and a fit time.";
 }
 
@@ -121,9 +122,9 @@ function points(x, y, scene) {
   const number = +byId("group").value, chosen = group();
   if (scene === ALL) return Object.keys(chosen.estimates).flatMap(label => {
     const { figures, runs, failed } = chosen.estimates[label];
-    if (!(x in figures) || !(y in figures)) return [];
+    if (!Object.hasOwn(figures, x) || !Object.hasOwn(figures, y)) return [];
     const note = `${runs} runs` + (failed ? `, ${failed} failed` : "");
-    return [{ label, x: figures[x], y: figures[y], note, run: data.runs.findIndex(r => r.group === number && r.label === label) }];
+    return [{ label, failed, x: figures[x], y: figures[y], note, run: data.runs.findIndex(r => r.group === number && r.label === label) }];
   });
   const found = new Map();
   data.runs.forEach((run, n) => {
@@ -136,7 +137,9 @@ function points(x, y, scene) {
     x: { value: median(runs.map(r => r.x)), interval: [Math.min(...runs.map(r => r.x)), Math.max(...runs.map(r => r.x))] },
     y: { value: median(runs.map(r => r.y)), interval: [Math.min(...runs.map(r => r.y)), Math.max(...runs.map(r => r.y))] } }));
 }
-function front(found, x, y) {
+// Whoever failed in some runs stands on no front: what is left of it may be the easy ones.
+function front(all, x, y) {
+  const found = all.filter(p => !p.failed);
   const xs = data.metrics[x].better === "higher" ? -1 : 1, ys = data.metrics[y].better === "higher" ? -1 : 1;
   return found.filter((p, i) => !found.some((q, j) => j !== i && xs * q.x.value <= xs * p.x.value && ys * q.y.value <= ys * p.y.value &&
     (xs * q.x.value < xs * p.x.value || ys * q.y.value < ys * p.y.value || j < i))).sort((a, b) => xs * (a.x.value - b.x.value));
@@ -151,15 +154,15 @@ function drawCost() {
   for (const p of found) {
     const { colour, shape } = look(p.label);
     traces.push({ x: [p.x.value], y: [p.y.value], error_x: bars([p], "x", colour), error_y: bars([p], "y", colour), name: plain(p.label), mode: "markers",
-      marker: { color: colour, symbol: shape, size: 12 }, customdata: [p.run], hovertemplate: `${plain(p.label)}<br>%{x:.4g}, %{y:.4g}<extra>${plain(p.note)}</extra>` });
+      marker: { color: colour, symbol: p.failed ? `${shape}-open` : shape, size: 12 }, customdata: [p.run], hovertemplate: `${plain(p.label)}<br>%{x:.4g}, %{y:.4g}<extra>${plain(p.note)}</extra>` });
   }
   const chart = byId("cost");
   chart.front = best.map(p => p.label);
   Plotly.react(chart, traces, layout({ xaxis: { type: data.metrics[x].log ? "log" : "linear", title: { text: data.metrics[x].label + (data.metrics[x].log ? ", log scale" : "") } },
     yaxis: { title: { text: data.metrics[y].label } } }), CONFIG).then(openPoint);
-  const filtered = data.metrics[y].filtered ? found.filter(p => (group().estimates[p.label] || {}).mixed).map(p => p.label) : [];
+  const filtered = data.metrics[y].filtered ? found.filter(p => Object.hasOwn(group().estimates, p.label) && group().estimates[p.label].mixed).map(p => p.label) : [];
   byId("cost-note").textContent = found.length
-    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + "A click opens a run." + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
+    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + (found.some(p => p.failed) ? "Hollow marks: some runs failed; these count with the quality of `nothing`. " : "") + "A click opens a run." + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
     : "No run has both figures.";
 }
 
@@ -199,8 +202,8 @@ function drawChases() {
 
 function drawSummary() {
   const chosen = group(), names = ["psnr", "lpips", "miou", "spill", "jitter_error", "fit_seconds", "peak_memory_bytes", "storage_bytes", "render_fps"];
-  const kept = chosen.entries.filter(label => label in chosen.estimates);
-  const shown = names.filter(name => kept.some(label => name in chosen.estimates[label].figures));
+  const kept = chosen.entries.filter(label => Object.hasOwn(chosen.estimates, label));
+  const shown = names.filter(name => kept.some(label => Object.hasOwn(chosen.estimates[label].figures, name)));
   const head = element("tr");
   head.append(element("th", "method"), element("th", "runs"), ...shown.map(name => element("th", data.metrics[name].label)), element("th", "hypervolume"));
   const cell = (found, digits) => {

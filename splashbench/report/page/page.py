@@ -54,12 +54,18 @@ def leaderboard_page(
         n = by_group[result.hardware_label, result.protocol_label, told_text(result.told)]
         return n, names[n][entry_key(result)]
 
-    runs = [run_facts(source.result, *place(source.result), source.path) for source in sources]
+    scenes = [group.scenes for group in found]
+    runs = []
+    for source in sources:
+        group, label = place(source.result)
+        scene = scenes[group][source.result.digests.scene]
+        runs.append(run_facts(source.result, group, label, scene, source.path))
     for run in runs:
         run["sheet"] = (sheets or {}).get(run["file"])
-    number = {source.result.digests.submission: n for n, source in enumerate(sources)}
+    # Not by digests: one submission may have been scored by two protocols.
+    number = {id(source.result): n for n, source in enumerate(sources)}
     rows = [
-        row_facts(row, *place(row["results"][0]), [number[result.digests.submission] for result in row["results"]])
+        row_facts(row, *place(row["results"][0]), [number[id(result)] for result in row["results"]])
         for _, row in table.iterrows()
     ]
     data = {
