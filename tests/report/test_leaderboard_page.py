@@ -16,7 +16,7 @@ from splashbench.report.page import PAGE, leaderboard_page
 from splashbench.report.page.content import command
 from splashbench.report.results import load_results
 from splashbench.report.statistics import pareto_mask
-from splashbench.report.table import leaderboard_table
+from splashbench.report.table import leaderboard_table, to_csv
 from splashbench.score.result import CheckpointScore, Result
 from splashbench.score.settings import PROTOCOL_V1
 
@@ -452,3 +452,22 @@ def test_the_paper_stands_apart_and_hollow(results: Path, browser: str, tmp_path
     symbols = browse(browser, page_of(results, with_paper=True), tmp_path, script)
     assert len(symbols) >= 4
     assert all(symbol.endswith("-open") for symbol in symbols)
+
+
+def test_the_committed_page_is_what_its_results_give() -> None:
+    folder = Path(__file__).parents[2] / "leaderboards" / "told_nothing"
+    if not folder.is_dir():
+        pytest.skip("the page of the project's runs lies in its repository alone")
+    sources = load_results(folder / "results")
+    table = leaderboard_table(sources)
+    assert (folder / "leaderboard.csv").read_text(encoding="utf-8") == to_csv(table), "run `make leaderboard`"
+    committed = data_of((folder / PAGE).read_text(encoding="utf-8"))
+    made = data_of(leaderboard_page(table, sources))
+    # Figures are rounded to six digits; another numpy may differ in the last.
+    for kept, new in zip(committed["groups"], made["groups"], strict=True):
+        assert kept["shared_scenes"] == new["shared_scenes"]
+        for label, entry in new["estimates"].items():
+            for name, found in entry["figures"].items():
+                assert kept["estimates"][label]["figures"][name]["value"] == pytest.approx(found["value"], rel=1e-4)
+    assert len(committed["runs"]) == len(made["runs"]) == len(sources)
+    assert any(run["sheet"] for run in committed["runs"])
