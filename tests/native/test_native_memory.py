@@ -66,3 +66,12 @@ def test_small_arrays_are_ordinary_ones():
     assert memory.empty((10, 3)).base is None
     assert memory.empty((0, 3)).shape == (0, 3)
     assert memory._buffers == []
+
+
+def test_giving_back_leaves_what_is_in_use():
+    kept = memory.empty(SHAPE)
+    kept[:] = 7
+    freed = [np.ones(300_000) for _ in range(50)]
+    del freed
+    memory.give_back()
+    assert (kept == 7).all()
