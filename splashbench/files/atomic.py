@@ -140,7 +140,12 @@ def files_together(directory: Path) -> Iterator[Path]:
         staging.mkdir()
         yield staging
         directory.mkdir(exist_ok=True)
-        for path in sorted(staging.iterdir()):
+        made = sorted(staging.iterdir())
+        for path in made:
+            # No file takes a folder's place: better found before the first one has moved.
+            if path.is_file() and (directory / path.name).is_dir():
+                raise SplashbenchError(f"{directory / path.name} is a folder; move it away, or write elsewhere")
+        for path in made:
             path.replace(directory / path.name)
     except OSError as error:
         raise_if_disk_full(directory, error)

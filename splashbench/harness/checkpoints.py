@@ -45,10 +45,10 @@ class Checkpoints:
         self._folder, self._elapsed, self._synchronise = folder, elapsed, synchronise
         self._left = list(reversed(marks))
 
-    def offer(self, state: Callable[[], Savable]) -> float:
-        """Take what `state` makes where a mark has come; returns the seconds that this took, 0 where none has."""
+    def offer(self, state: Callable[[], Savable]) -> None:
+        """Take what `state` makes where a mark has come."""
         if not self._left or self._elapsed() < self._left[-1]:
-            return 0.0
+            return
         self._synchronise()
         elapsed, start = self._elapsed(), time.perf_counter()
         place = self._folder / f"{len(self.seconds):02d}"
@@ -59,9 +59,7 @@ class Checkpoints:
         # Of the marks that one long step went past, one state serves all.
         while self._left and self._left[-1] <= elapsed:
             self._left.pop()
-        spent = time.perf_counter() - start
-        self.spent += spent
-        return spent
+        self.spent += time.perf_counter() - start
 
 
 @contextmanager

@@ -109,7 +109,7 @@ class Run:
                 change the fit: with or without checkpoints the same model has to come out.
         """
         if self._checkpoints is not None:
-            self._overhead_seconds += self._checkpoints.offer(state)
+            self._checkpoints.offer(state)
 
     def side_by_side(
         self, first: Callable[[Run], T], second: Callable[[Run], U], span: tuple[float, float] = (0.0, 1.0)
@@ -168,7 +168,8 @@ class Run:
 
     def fit_seconds(self, wall_seconds: float) -> float:
         """What a fit of `wall_seconds` would have taken by itself: with the fits of what it reused."""
-        return max(0.0, wall_seconds - self._overhead_seconds) + sum(self.reused.values())
+        spent = self._overhead_seconds + self._checkpoint_seconds()
+        return max(0.0, wall_seconds - spent) + sum(self.reused.values())
 
 
 class MethodConfig(BaseModel):

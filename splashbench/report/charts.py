@@ -83,9 +83,11 @@ def _panel(axes: Axes, row: Machine, name: str, looks: dict[str, tuple[str, str]
             _draw_entry(axes, entry, mean, name, looks[entry.label], largest, row.reported)
             if entry.scenes and len(entry.scenes) < row.n_scenes:
                 note = f"{len(entry.scenes)} of {row.n_scenes} scenes"
-                axes.annotate(note, (mean.seconds, mean.value), (9, 5), textcoords="offset points", fontsize=7.5)
+                axes.annotate(
+                    note, (mean.seconds.value, mean.value.value), (9, 5), textcoords="offset points", fontsize=7.5
+                )
     if summaries:
-        _draw_front(axes, [(s.seconds, s.value) for s in summaries.values()], higher)
+        _draw_front(axes, [(s.seconds.value, s.value.value) for s in summaries.values()], higher)
     axes.set_xscale("log")
     _set_limits(axes, row, name, summaries)
     _draw_controls(axes, row, name)
@@ -108,13 +110,14 @@ def _draw_entry(
         dots = [(dot.seconds, dot.values[name]) for dot in entry.dots if name in dot.values]
         seconds, values = zip(*dots)
         axes.scatter(seconds, values, s=12, marker=shape, color=colour, alpha=0.3, linewidths=0, zorder=2)
-    for interval, bar in ((mean.seconds_interval, "h"), (mean.value_interval, "v")):
+    x, y = mean.seconds.value, mean.value.value
+    for interval, bar in ((mean.seconds.interval, "h"), (mean.value.interval, "v")):
         if interval:
-            ends = (interval, (mean.value,) * 2) if bar == "h" else ((mean.seconds,) * 2, interval)
+            ends = (interval, (y, y)) if bar == "h" else ((x, x), interval)
             axes.plot(*ends, color=colour, linewidth=1.1, zorder=3)
     axes.scatter(
-        [mean.seconds],
-        [mean.value],
+        [x],
+        [y],
         s=_area(entry.memory_bytes(), largest),
         marker=shape,
         facecolors="none" if reported else colour,
@@ -146,7 +149,7 @@ def _set_limits(axes: Axes, row: Machine, name: str, summaries: dict[str, Summar
     axes.set_xticks([value for value, _ in ticks], [label for _, label in ticks])
     axes.minorticks_off()
     values = [dot.values[name] for entry in row.entries for dot in entry.dots if name in dot.values]
-    values += [s.value_interval[i] for s in summaries.values() if s.value_interval for i in (0, 1)]
+    values += [end for s in summaries.values() for end in s.value.interval or ()]
     values += [figures[name] for method, figures in row.controls.items() if name in figures and _on_scale(method, name)]
     bottom, top = (min(values), max(values)) if values else (0.0, 1.0)
     margin = 0.14 * (top - bottom) or 0.1 * max(abs(top), 1e-3)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_image, write_image
+from splashbench.files import image_size, read_image, write_image
 from splashbench.pages import data_uri
 from splashbench.report.contact_sheet import spread_times
 from splashbench.scene import Scene
@@ -24,7 +24,7 @@ _GAP = 3
 _QUALITY = 80
 _OUTLINE = (230, 159, 0)
 #: A sheet has some 60 kB; larger ones are none of ours.
-_MAX_BYTES = 2 << 20
+_MAX_BYTES, _MAX_PIXELS = 2 << 20, 8 << 20
 
 
 def sheet_path(result: Path) -> Path:
@@ -60,6 +60,9 @@ def embedded_sheet(result: Path) -> str | None:
     if not path.is_file() or path.is_symlink() or path.stat().st_size > _MAX_BYTES:
         return None
     try:
+        width, height = image_size(path)
+        if width * height > _MAX_PIXELS:
+            return None
         read_image(path)
     except SplashbenchError:
         return None

@@ -11,24 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splashbench.report.groups import Group, groups
 from splashbench.report.results import ResultFile
+from splashbench.report.statistics import Estimate, estimate
 from splashbench.score.result import Result
-
-_BOOTSTRAP_SAMPLES = 2000
-_MIN_RUNS_FOR_BARS = 3
-_TRIM = 0.25
 
 
 @dataclass(frozen=True)
 class Dot:
-    """One run, or one reported figure: seconds of fitting, and the values it has."""
+    """One run, or one reported figure: seconds of fitting, the values it has, and of which scene (its digest)."""
 
     seconds: float
     values: dict[str, float]
     memory_bytes: float | None
+    scene: str = ""
 
 
 @dataclass
@@ -38,7 +35,10 @@ class ChartedMethod:
     label: str
     mixed: bool = False
     dots: list[Dot] = field(default_factory=list)
-    scenes: set[str] = field(default_factory=set)
+
+    @property
+    def scenes(self) -> set[str]:
+        return {dot.scene for dot in self.dots}
 
     def memory_bytes(self) -> float | None:
         """Median over the runs that measured it."""
@@ -47,18 +47,25 @@ class ChartedMethod:
 
     def summary(self, name: str) -> Summary | None:
         """Inter-quartile mean of time and of metric `name` over the runs that have it."""
-        pairs = np.array([[np.log10(d.seconds), d.values[name]] for d in self.dots if name in d.values])
-        return summarize(pairs) if len(pairs) else None
+        by_scene: dict[str, list[Dot]] = defaultdict(list)
+        for dot in self.dots:
+            if name in dot.values:
+                by_scene[dot.scene].append(dot)
+        if not by_scene:
+            return None
+        runs = by_scene.values()
+        return Summary(
+            seconds=estimate([np.log10([dot.seconds for dot in scene]) for scene in runs]).on(lambda x: 10.0**x),
+            value=estimate([np.array([dot.values[name] for dot in scene]) for scene in runs]),
+        )
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Inter-quartile means, and their 95% bootstrap intervals where three runs or more allow them."""
+    """Inter-quartile means of time (of its logarithm; seconds) and of a metric, with their intervals."""
 
-    seconds: float
-    value: float
-    seconds_interval: tuple[float, float] | None
-    value_interval: tuple[float, float] | None
+    seconds: Estimate
+    value: Estimate
 
 
 _SHOWN = ("lpips", "miou", "dpsnr_bg", "psnr")
@@ -85,24 +92,6 @@ class Machine:
         dots = [dot for entry in self.entries for dot in entry.dots]
         measured = {name for dot in dots for name in dot.values}
         return "miou" if "miou" in measured and "lpips" not in measured else "lpips"
-
-
-def summarize(pairs: NDArray[np.float64]) -> Summary:
-    """Inter-quartile means of `pairs` [n, 2] of (log10 seconds, value), runs resampled together for the intervals."""
-    from scipy.stats import trim_mean
-
-    log_seconds, value = trim_mean(pairs, _TRIM, axis=0)
-    if len(pairs) < _MIN_RUNS_FOR_BARS:
-        return Summary(float(10**log_seconds), float(value), None, None)
-    rng = np.random.default_rng(0)
-    resampled = pairs[rng.integers(len(pairs), size=(_BOOTSTRAP_SAMPLES, len(pairs)))]
-    low, high = np.percentile(trim_mean(resampled, _TRIM, axis=1), [2.5, 97.5], axis=0)
-    return Summary(
-        float(10**log_seconds),
-        float(value),
-        (float(10 ** low[0]), float(10 ** high[0])),
-        (float(low[1]), float(high[1])),
-    )
 
 
 def pareto_front(points: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
@@ -139,8 +128,7 @@ def _machine(group: Group) -> Machine:
                 machine.failures[f"{result.method}: fit time not measured"] += 1
             else:
                 memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
-                charted.dots.append(Dot(seconds, _shown_values(result), memory))
-                charted.scenes.add(result.digests.scene)
+                charted.dots.append(Dot(seconds, _shown_values(result), memory, result.digests.scene))
         if charted.dots:
             machine.entries.append(charted)
     controls: dict[str, list[dict[str, float]]] = defaultdict(list)

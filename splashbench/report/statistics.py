@@ -41,9 +41,7 @@ def interquartile_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of `values` [..., n], NaN left out: [...]."""
-    there = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(there, values, 0.0).sum(axis=-1) / np.where(there.any(-1), there.sum(-1), np.nan))
+    return np.asarray(np.nanmean(values, axis=-1))
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,11 @@ class Estimate:
 
     value: float
     interval: tuple[float, float] | None = None
+
+    def on(self, scale: Callable[[float], float]) -> Estimate:
+        """The same on another, rising scale."""
+        ends = self.interval and (scale(self.interval[0]), scale(self.interval[1]))
+        return Estimate(scale(self.value), ends)
 
 
 def resampled(by_scene: Sequence[NDArray[np.float64]], samples: int = SAMPLES) -> NDArray[np.float64]:
@@ -85,22 +88,6 @@ def estimate(
         return Estimate(value)
     low, high = np.percentile(statistic(resampled(by_scene, samples)), [50 - _LEVEL / 2, 50 + _LEVEL / 2])
     return Estimate(value, (float(low), float(high)))
-
-
-def pareto_mask(costs: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """bool [n]: the points of `costs` [n, d], less being better in each, that no other point beats.
-
-    A point beats another where it is nowhere worse and somewhere better; of equal points the first one stands.
-    """
-    n = len(costs)
-    kept = np.ones(n, bool)
-    for i in range(n):
-        others = np.delete(np.arange(n), i)
-        no_worse = (costs[others] <= costs[i]).all(axis=1)
-        better = (costs[others] < costs[i]).any(axis=1)
-        same_before = ~better & (others < i)
-        kept[i] = not (no_worse & (better | same_before)).any()
-    return kept
 
 
 def hypervolume(costs: NDArray[np.float64]) -> float:

@@ -17,7 +17,7 @@ from typing import Any
 from splashbench import progress
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
-from splashbench.score.image.lpips import Lpips, load_lpips
+from splashbench.score.image.lpips import load_lpips
 from splashbench.score.image.views import Track, score_views
 from splashbench.score.metrics import METRICS
 from splashbench.score.particles.physics import liquid_particles, score_particles
@@ -65,8 +65,12 @@ def score_submission(
     if status == _OK:
         lpips, no_lpips = load_lpips(lpips_weights)
         weights_digest = lpips.digest if lpips else None
-        metrics |= score_views(scene, submission, reference, lpips, no_lpips, protocol, track)
-        checkpoints = _score_checkpoints(scene, submission, reference, lpips, no_lpips, protocol, track)
+
+        def images(views: Any, track: Track) -> dict[str, MetricValue]:
+            return score_views(scene, views, reference, lpips, no_lpips, protocol, track)
+
+        metrics |= images(submission, track)
+        checkpoints = _score_checkpoints(submission, images, track)
         fields = fields or shared_fields(scene, protocol)
         particles, no_particles = liquid_particles(scene, submission)
         metrics |= score_particles(scene, particles, no_particles, fields, protocol, track)
@@ -109,19 +113,14 @@ def score_submission(
 
 
 def _score_checkpoints(
-    scene: Scene,
-    submission: Any,
-    reference: Any | None,
-    lpips: Lpips | None,
-    no_lpips: str,
-    protocol: Protocol,
-    track: Track,
+    submission: Any, score: Callable[[Any, Track], dict[str, MetricValue]], track: Track
 ) -> tuple[CheckpointScore, ...]:
-    """The image metrics of every state of the fit that was kept, in the order of time."""
-    record = submission.record
-    views = {checkpoint.folder: of for checkpoint, of in submission.checkpoints()} if record.checkpoints else {}
+    """The image metrics of every state of the fit that was kept, in the order of time; `score` gives those of views."""
+    if not submission.record.checkpoints:
+        return ()
+    views = {checkpoint.folder: of for checkpoint, of in submission.checkpoints()}
     scores = []
-    for checkpoint in record.checkpoints:
+    for checkpoint in submission.record.checkpoints:
         figures: dict[str, float | None] = {}
         if checkpoint.folder in views:
             moment = f"after {checkpoint.seconds:.0f} s, "
@@ -129,8 +128,7 @@ def _score_checkpoints(
             def told(steps: Iterable[int], what: str, moment: str = moment) -> Iterator[int]:
                 return track(steps, moment + what)
 
-            found = score_views(scene, views[checkpoint.folder], reference, lpips, no_lpips, protocol, told)
-            figures = {name: value.value for name, value in found.items()}
+            figures = {name: value.value for name, value in score(views[checkpoint.folder], told).items()}
         scores.append(
             CheckpointScore(
                 seconds=checkpoint.seconds,

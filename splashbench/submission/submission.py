@@ -80,14 +80,30 @@ def _files(directory: Path) -> list[str]:
     return sorted(name for name in names if name != SUMS)
 
 
-class Submission:
+class Views:
+    """The test views in a folder: of a submission, or of a state of its fit on its way. identity: of the submission."""
+
+    def __init__(self, directory: Path, identity: Identity) -> None:
+        self.directory, self.identity = Path(directory), identity
+
+    def rendering(self, camera: str, t: int) -> NDArray[np.uint8]:
+        """Rendered sRGB uint8 [H, W, 3] of test view `camera` at timestep `t`."""
+        return read_image(render_path(self.directory, "renders", camera, t))
+
+    def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
+        """Rendered foreground opacity [H, W] in [0, 1] of test view `camera` at timestep `t`."""
+        return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
+
+
+class Submission(Views):
     """A verified submission. Use `Submission.open`.
 
     Attributes: directory; identity (method, preset, seed, scene ...); record (costs); status; reason.
     """
 
     def __init__(self, directory: Path, identity: Identity, record: Record) -> None:
-        self.directory, self.identity, self.record = Path(directory), identity, record
+        super().__init__(directory, identity)
+        self.record = record
         self.status, self.reason = record.status, record.reason
 
     @classmethod
@@ -110,18 +126,10 @@ class Submission:
         """SHA-256 of SHA256SUMS: names this submission's exact bytes."""
         return sha256_file(self.directory / SUMS)
 
-    def rendering(self, camera: str, t: int) -> NDArray[np.uint8]:
-        """Rendered sRGB uint8 [H, W, 3] of test view `camera` at timestep `t`."""
-        return read_image(render_path(self.directory, "renders", camera, t))
-
-    def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
-        """Rendered foreground opacity [H, W] in [0, 1] of test view `camera` at timestep `t`."""
-        return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
-
-    def checkpoints(self) -> list[tuple[Checkpoint, CheckpointViews]]:
+    def checkpoints(self) -> list[tuple[Checkpoint, Views]]:
         """The states of the fit on its way, with their views; of those that have some (status ok)."""
         return [
-            (checkpoint, CheckpointViews(self, self.directory / checkpoint.folder))
+            (checkpoint, Views(self.directory / checkpoint.folder, self.identity))
             for checkpoint in self.record.checkpoints
             if checkpoint.status == Status.OK
         ]
@@ -135,19 +143,6 @@ class Submission:
         """The liquid's signed distance, or None."""
         path = self.directory / "geometry.npz"
         return SignedDistance.load(path) if path.is_file() else None
-
-
-class CheckpointViews:
-    """The views of one checkpoint: `rendering` and `alpha` as those of `Submission`, and its identity."""
-
-    def __init__(self, submission: Submission, directory: Path) -> None:
-        self.identity, self.directory = submission.identity, directory
-
-    def rendering(self, camera: str, t: int) -> NDArray[np.uint8]:
-        return read_image(render_path(self.directory, "renders", camera, t))
-
-    def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
-        return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
 
 
 def integrity_faults(directory: Path) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from splashbench.cli.main import main
+from splashbench.errors import SplashbenchError
 from splashbench.files import files_together
 
 Fails = Callable[..., str]
@@ -101,4 +102,13 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     with files_together(tmp_path / "out") as staging:
         (staging / "first").write_text("whole")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["first", "mine"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_files_that_belong_together_do_not_come_in_part(tmp_path: Path) -> None:
+    (tmp_path / "out" / "b.txt").mkdir(parents=True)
+    with pytest.raises(SplashbenchError, match=r"b\.txt is a folder"), files_together(tmp_path / "out") as staging:
+        for name in ("a.txt", "b.txt", "c.txt"):
+            (staging / name).write_text("new")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["b.txt"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -86,8 +86,9 @@ def test_a_state_is_taken_at_the_first_offer_after_each_mark(tmp_path: Path) -> 
         return Grey(0.5)
 
     for elapsed.seconds in (0.0, 0.9, 1.1, 1.2, 5.0, 7.9, 8.0, 9.0):
-        spent = taken.offer(state)
-        assert (spent > 0) == (len(asked) > 0 and asked[-1] == elapsed.seconds)
+        before = taken.spent
+        taken.offer(state)
+        assert (taken.spent > before) == (len(asked) > 0 and asked[-1] == elapsed.seconds)
     # One step went past two marks: its state serves both.
     assert taken.seconds == asked == [1.1, 5.0, 8.0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00", "01", "02"]

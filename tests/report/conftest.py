@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from splashbench.report.page import leaderboard_page
+from splashbench.report.results import load_results
+from splashbench.report.table import leaderboard_table
 from splashbench.score.metrics import METRICS
-from splashbench.score.result import Digests, Result, metric_value
+from splashbench.score.result import CheckpointScore, Digests, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1
 
 MakeResult = Callable[..., Result]
@@ -86,3 +92,72 @@ def folder(tmp_path: Path) -> Path:
         make("oracle", 0, scene, control=True, psnr=100.0, dpsnr_bg=82.5, lpips=0.0).save(directory)
     make("gamma", 0, "bowl", "out_of_memory", "killed (signal 9) | of 8 GiB").save(directory)
     return directory
+
+
+def course_of(*states: tuple[float, float]) -> tuple[CheckpointScore, ...]:
+    """Checkpoints at (seconds, PSNR)."""
+    return tuple(
+        CheckpointScore(seconds=s, metrics={"psnr": psnr, "lpips": 1 / psnr, "miou": psnr / 40}) for s, psnr in states
+    )
+
+
+@pytest.fixture
+def course() -> Callable[..., tuple[CheckpointScore, ...]]:
+    return course_of
+
+
+@pytest.fixture
+def results(make_result: MakeResult, tmp_path: Path) -> Path:
+    """Three methods and `nothing` on two scenes with two seeds, a failed run, and one on another machine."""
+    directory = tmp_path / "results"
+    figures: dict[str, Any] = {"lpips": 0.05, "miou": 0.7, "peak_memory_bytes": 2.0**30, "storage_bytes": 3e6}
+    for s, scene in enumerate(("bowl", "tank")):
+        for seed in range(2):
+            shift = s + 0.1 * seed
+            for method, psnr, seconds, states in (
+                ("fast", 22.0, 9.0, course_of((5.1, 20.0 + shift))),
+                ("good", 28.0, 80.0, course_of((6.0, 15.0), (11.0, 24.0 + shift), (41.0, 27.0 + shift))),
+                ("slow", 26.0, 300.0, course_of((41.0, 21.0), (170.0, 25.0))),
+            ):
+                make_result(
+                    method,
+                    seed,
+                    scene,
+                    psnr=psnr + shift,
+                    fit_seconds=seconds,
+                    checkpoints=states,
+                    told=("times",),
+                    stages={"fit": seconds - 1, "rest": 1.0},
+                    overrides=("iterations=7",) if method == "fast" else (),
+                    **{**figures, "storage_bytes": 1e6 * seconds},
+                ).save(directory)
+        make_result("nothing", 0, scene, control=True, psnr=12.0, fit_seconds=3.0, told=("times",)).save(directory)
+    make_result("broken", 0, "bowl", status="crashed", reason="no memory", told=("times",)).save(directory)
+    make_result("good", 0, "bowl", cpu="another", psnr=50.0, fit_seconds=1.0, told=("times",), **figures).save(
+        directory
+    )
+    return directory
+
+
+@pytest.fixture
+def page_of() -> Callable[..., str]:
+    """The leaderboard's page of a folder of results."""
+
+    def make_page(results: Path, with_paper: bool = False) -> str:
+        sources = load_results(results)
+        return leaderboard_page(leaderboard_table(sources), sources, with_paper)
+
+    return make_page
+
+
+@pytest.fixture
+def data_of() -> Callable[[str], dict[str, Any]]:
+    """The data that a page holds."""
+
+    def read(page: str) -> dict[str, Any]:
+        found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+        assert found is not None
+        data: dict[str, Any] = json.loads(found[1])
+        return data
+
+    return read

@@ -1,9 +1,7 @@
 """The leaderboard's page: what it holds, that it needs nothing but itself, and how it behaves in a browser."""
 
-import json
 import re
-import shutil
-import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,84 +9,19 @@ import numpy as np
 import pytest
 
 from splashbench.cli.main import main
-from splashbench.files import read_image
 from splashbench.report.page import PAGE, leaderboard_page
 from splashbench.report.page.content import command
 from splashbench.report.results import load_results
-from splashbench.report.statistics import pareto_mask
 from splashbench.report.table import leaderboard_table, to_csv
-from splashbench.score.result import CheckpointScore, Result
+from splashbench.score.result import Result
 from splashbench.score.settings import PROTOCOL_V1
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-CHOOSE = """
-const choose = (id, value) => {
-  const box = document.getElementById(id);
-  box.value = value;
-  box.dispatchEvent(new Event("change"));
-};
-"""
-#: Goes before the page's own script: collects what it complains of.
-WATCH = """<script>
-window.faults = [];
-addEventListener("error", event => faults.push(String(event.message)));
-addEventListener("unhandledrejection", event => faults.push(String(event.reason)));
-console.error = (...words) => faults.push(words.join(" "));
-</script>"""
+PageOf = Callable[..., str]
+DataOf = Callable[[str], dict[str, Any]]
+Course = Callable[..., Any]
 
 
-def course(*states: tuple[float, float]) -> tuple[CheckpointScore, ...]:
-    """Checkpoints at (seconds, PSNR)."""
-    return tuple(
-        CheckpointScore(seconds=s, metrics={"psnr": psnr, "lpips": 1 / psnr, "miou": psnr / 40}) for s, psnr in states
-    )
-
-
-@pytest.fixture
-def results(make_result: Any, tmp_path: Path) -> Path:
-    """Three methods and `nothing` on two scenes with two seeds, a failed run, and one on another machine."""
-    directory = tmp_path / "results"
-    figures: dict[str, Any] = {"lpips": 0.05, "miou": 0.7, "peak_memory_bytes": 2.0**30, "storage_bytes": 3e6}
-    for s, scene in enumerate(("bowl", "tank")):
-        for seed in range(2):
-            shift = s + 0.1 * seed
-            for method, psnr, seconds, states in (
-                ("fast", 22.0, 9.0, course((5.1, 20.0 + shift))),
-                ("good", 28.0, 80.0, course((6.0, 15.0), (11.0, 24.0 + shift), (41.0, 27.0 + shift))),
-                ("slow", 26.0, 300.0, course((41.0, 21.0), (170.0, 25.0))),
-            ):
-                make_result(
-                    method,
-                    seed,
-                    scene,
-                    psnr=psnr + shift,
-                    fit_seconds=seconds,
-                    checkpoints=states,
-                    told=("times",),
-                    stages={"fit": seconds - 1, "rest": 1.0},
-                    overrides=("iterations=7",) if method == "fast" else (),
-                    **{**figures, "storage_bytes": 1e6 * seconds},
-                ).save(directory)
-        make_result("nothing", 0, scene, control=True, psnr=12.0, fit_seconds=3.0, told=("times",)).save(directory)
-    make_result("broken", 0, "bowl", status="crashed", reason="no memory", told=("times",)).save(directory)
-    make_result("good", 0, "bowl", cpu="another", psnr=50.0, fit_seconds=1.0, told=("times",), **figures).save(
-        directory
-    )
-    return directory
-
-
-def page_of(results: Path, with_paper: bool = False) -> str:
-    sources = load_results(results)
-    return leaderboard_page(leaderboard_table(sources), sources, with_paper)
-
-
-def data_of(page: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
-    return json.loads(found[1])
-
-
-def test_the_page_needs_nothing_but_itself_and_is_always_the_same(results: Path) -> None:
+def test_the_page_needs_nothing_but_itself_and_is_always_the_same(results: Path, page_of: PageOf) -> None:
     page = page_of(results)
     assert page == page_of(results)
     assert len(page) < 8 << 20
@@ -98,7 +31,7 @@ def test_the_page_needs_nothing_but_itself_and_is_always_the_same(results: Path)
     assert re.findall(r"""(?:src|href)\s*=|@import|url\(|fetch\(|XMLHttpRequest|https?://""", own) == []
 
 
-def test_names_from_strangers_stay_text(make_result: Any, tmp_path: Path) -> None:
+def test_names_from_strangers_stay_text(make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf) -> None:
     hostile = "</script><img src=x onerror=alert(1)>"
     make_result("alpha", scene=hostile, reason=hostile, psnr=20.0, fit_seconds=9.0).save(tmp_path / "results")
     make_result(
@@ -109,7 +42,7 @@ def test_names_from_strangers_stay_text(make_result: Any, tmp_path: Path) -> Non
     assert data_of(page)["rows"][0]["scene"] == hostile
 
 
-def test_failed_runs_and_machines_are_kept_apart(results: Path) -> None:
+def test_failed_runs_and_machines_are_kept_apart(results: Path, page_of: PageOf, data_of: DataOf) -> None:
     data = data_of(page_of(results))
     assert len(data["groups"]) == 2
     here = data["groups"][1]
@@ -122,7 +55,9 @@ def test_failed_runs_and_machines_are_kept_apart(results: Path) -> None:
     assert [row["status"] for row in data["rows"]].count("crashed") == 1
 
 
-def test_means_are_over_scenes_that_methods_have_in_common(make_result: Any, tmp_path: Path) -> None:
+def test_means_are_over_scenes_that_methods_have_in_common(
+    make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf
+) -> None:
     for method, scenes in (("a", "abcd"), ("b", "abc"), ("c", "abc"), ("d", "d")):
         for scene in scenes:
             psnr = 20.0 + "abcd".index(scene) + "abcd".index(method) / 10
@@ -137,7 +72,9 @@ def test_means_are_over_scenes_that_methods_have_in_common(make_result: Any, tmp
     assert here["scenes"] == ["a", "b", "c", "d"]
 
 
-def test_a_failed_run_has_the_quality_of_nothing(results: Path, make_result: Any) -> None:
+def test_a_failed_run_has_the_quality_of_nothing(
+    results: Path, make_result: Any, page_of: PageOf, data_of: DataOf
+) -> None:
     next(path for path in results.glob("good__bowl__*") if "test processor" in path.read_text()).unlink()
     make_result("good", 7, scene="bowl", status="out_of_memory", reason="killed", told=("times",)).save(results)
     here = data_of(page_of(results))["groups"][-1]
@@ -148,7 +85,7 @@ def test_a_failed_run_has_the_quality_of_nothing(results: Path, make_result: Any
     assert 28.4 < entry["figures"]["psnr"]["value"] < 28.6
 
 
-def test_odd_results_do_not_stop_the_page(make_result: Any, tmp_path: Path) -> None:
+def test_odd_results_do_not_stop_the_page(make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf) -> None:
     folder = tmp_path / "results"
     make_result("a", fit_seconds=0.0, psnr=20.0, settings={"rate": float("nan")}).save(folder)
     make_result("b", fit_seconds=9.0, psnr=21.0).save(folder)
@@ -157,11 +94,13 @@ def test_odd_results_do_not_stop_the_page(make_result: Any, tmp_path: Path) -> N
     path = next(folder.glob("a__*"))
     path.write_text(path.read_text().replace('"rate": null', '"rate": NaN'))
     data = data_of(page_of(folder))
-    assert {"rate": "NaN"} in data["settings"].values() or {"rate": None} in data["settings"].values()
+    assert {"rate": "NaN"} in data["settings"].values()
     assert len(data["rows"]) == 4
 
 
-def test_one_submission_scored_by_two_protocols_is_two_runs(make_result: Any, tmp_path: Path) -> None:
+def test_one_submission_scored_by_two_protocols_is_two_runs(
+    make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf
+) -> None:
     first: Result = make_result("a", psnr=20.0, fit_seconds=9.0)
     changed = PROTOCOL_V1.model_copy(update={"opacity_threshold": 0.3})
     digests = first.digests.model_copy(update={"protocol": changed.digest})
@@ -176,14 +115,16 @@ def test_one_submission_scored_by_two_protocols_is_two_runs(make_result: Any, tm
         assert data["runs"][number]["group"] == row["group"]
 
 
-def test_what_scenes_told_is_never_mixed_in_a_row(make_result: Any, tmp_path: Path) -> None:
+def test_what_scenes_told_is_never_mixed_in_a_row(
+    make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf
+) -> None:
     make_result("a", 0, psnr=20.0, told=None).save(tmp_path / "results")
     make_result("a", 1, psnr=22.0, told=("times", "gravity")).save(tmp_path / "results")
     rows = data_of(page_of(tmp_path / "results"))["rows"]
     assert {(row["told"], row["cells"]["psnr"][0]) for row in rows} == {("not noted", 20.0), ("times, gravity", 22.0)}
 
 
-def test_who_leads_when(results: Path) -> None:
+def test_who_leads_when(results: Path, page_of: PageOf, data_of: DataOf) -> None:
     here = data_of(page_of(results))["groups"][1]
     leaders = {s["seconds"]: [place["label"] for place in s["ranking"]] for s in here["standings"]["psnr"]}
     # At 10 s `good` has 15 dB and `fast` is done; `slow` begins at 41 s.
@@ -195,7 +136,7 @@ def test_who_leads_when(results: Path) -> None:
     assert at_ten["lead"]["probability"] is None
 
 
-def test_curves_begin_where_every_run_has_a_value(results: Path) -> None:
+def test_curves_begin_where_every_run_has_a_value(results: Path, page_of: PageOf, data_of: DataOf) -> None:
     here = data_of(page_of(results))["groups"][1]
     curves = {curve["label"]: curve for curve in here["curves"]["psnr"]}
     # `nothing` was run on both scenes, so that each curve begins with what it shows.
@@ -205,7 +146,7 @@ def test_curves_begin_where_every_run_has_a_value(results: Path) -> None:
     assert "broken" not in curves
 
 
-def test_without_the_control_nothing_a_curve_begins_later(results: Path) -> None:
+def test_without_the_control_nothing_a_curve_begins_later(results: Path, page_of: PageOf, data_of: DataOf) -> None:
     for path in results.glob("nothing__*"):
         path.unlink()
     here = data_of(page_of(results))["groups"][1]
@@ -213,7 +154,7 @@ def test_without_the_control_nothing_a_curve_begins_later(results: Path) -> None
     assert slow["x"][0] >= 41
 
 
-def test_the_time_to_the_others_quality_charges_failures(results: Path) -> None:
+def test_the_time_to_the_others_quality_charges_failures(results: Path, page_of: PageOf, data_of: DataOf) -> None:
     here = data_of(page_of(results))["groups"][1]
     chases = {(chase["label"], chase["target"]): chase for chase in here["chases"]["psnr"]}
     # `good` passes the 22.05 dB that `fast` ends with on the first scene at 11 s: 11 of 9 seconds.
@@ -223,14 +164,23 @@ def test_the_time_to_the_others_quality_charges_failures(results: Path) -> None:
     assert chases["broken", "fast"]["ratio"] is None
 
 
-def test_the_command_makes_the_run_again(make_result: Any) -> None:
+def test_the_command_makes_the_run_again(make_result: Any, course: Course) -> None:
     result: Result = make_result("alpha", 3, "my bowl", overrides=("a=1", "b=x y"), checkpoints=course((5.0, 20.0)))
     assert command(result) == (
         "splashbench run alpha 'scenes/my bowl' OUT --preset best --seed 3 --checkpoints --set a=1 --set 'b=x y'"
     )
 
 
-def test_pictures_are_embedded_where_they_lie_beside_results(results: Path, tmp_path: Path) -> None:
+def test_an_external_code_has_its_own_command(make_result: Any) -> None:
+    settings = {"format": "blender", "command": "train {scene} {out}", "importer": "scaffold_4d", "points": 2000}
+    result: Result = make_result("theirs", 2, "bowl", settings=settings)
+    assert command(result) == (
+        "splashbench run-external scenes/bowl OUT --name theirs --seed 2 --format blender "
+        "--command 'train {scene} {out}' --import scaffold_4d"
+    )
+
+
+def test_pictures_are_embedded_where_they_lie_beside_results(results: Path, tmp_path: Path, data_of: DataOf) -> None:
     from splashbench.files import write_image
 
     sources = load_results(results)
@@ -244,217 +194,7 @@ def test_pictures_are_embedded_where_they_lie_beside_results(results: Path, tmp_
     assert sheets[second.name] is None
 
 
-# --- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser() -> str:
-    for name in BROWSERS:
-        if found := shutil.which(name):
-            return found
-    pytest.skip(f"needs a browser, one of {', '.join(BROWSERS)} (Debian: apt install chromium)")
-
-
-def browse(browser: str, page: str, folder: Path, script: str, *options: str) -> Any:
-    """What `script`, which ends in `return ...`, returns once the page has been drawn."""
-    path = folder / "page.html"
-    after = f"""<script>
-addEventListener("load", async () => {{
-  await new Promise(resolve => setTimeout(resolve, 300));
-  let outcome;
-  try {{ outcome = await (async () => {{ {script} }})(); }} catch (error) {{ outcome = {{ error: String(error) }}; }}
-  const box = document.createElement("pre");
-  box.id = "outcome";
-  box.textContent = btoa(unescape(encodeURIComponent(JSON.stringify({{ outcome, faults }}))));
-  document.body.append(box);
-}});
-</script>"""
-    path.write_text(page.replace("<body>", f"<body>{WATCH}").replace("</body>", f"{after}</body>"), encoding="utf-8")
-    profile = f"--user-data-dir={folder / 'profile'}"
-    words = ["--headless=new", "--no-sandbox", "--disable-gpu", profile, "--virtual-time-budget=15000", *options]
-    done = subprocess.run(
-        [browser, *words, "--dump-dom", path.as_uri()], capture_output=True, text=True, timeout=120, check=False
-    )
-    found = re.search(r'<pre id="outcome">([A-Za-z0-9+/=]*)</pre>', done.stdout)
-    assert found is not None, done.stderr[-2000:]
-    import base64
-
-    answer = json.loads(base64.b64decode(found[1]))
-    assert answer["faults"] == []
-    assert "error" not in (answer["outcome"] or {}), answer["outcome"]
-    return answer["outcome"]
-
-
-SORTED = """
-const header = name => document.querySelector(`#rows th[data-column=${name}] button`);
-const column = n => [...document.querySelectorAll("#rows tbody tr")].map(row => row.cells[n].textContent);
-header("psnr").click();
-const falling = column(5);
-header("psnr").click();
-const rising = column(5);
-header("scene").click();
-return { falling, rising, scenes: column(0), sort: document.querySelector("#rows th[data-column=scene]").ariaSort };
-"""
-
-
-def test_headings_sort_and_what_has_no_figure_comes_last(results: Path, browser: str, tmp_path: Path) -> None:
-    found = browse(browser, page_of(results), tmp_path, SORTED)
-    for name, order in (("falling", sorted), ("rising", lambda values: sorted(values)[::-1])):
-        cells = found[name]
-        assert cells[-1] == "–"
-        values = [float(cell) for cell in cells[:-1]]
-        assert len(values) == 9
-        assert values == order(values)[::-1]
-    assert found["scenes"] == sorted(found["scenes"])
-    assert found["sort"] == "ascending"
-
-
-FILTERED = """
-const count = () => document.querySelectorAll("#rows tbody tr").length;
-const all = count();
-choose("filter-scene", "tank");
-const tank = count();
-document.getElementById("filter-controls").click();
-const methods = count();
-choose("filter-scene", "");
-choose("filter-status", "crashed");
-const failed = count();
-choose("filter-status", "");
-const search = document.getElementById("search");
-search.value = "GOOD"; search.dispatchEvent(new Event("input"));
-return { all, tank, methods, failed, good: count(), said: document.getElementById("table-count").textContent };
-"""
-
-
-def test_filters_work_together(results: Path, browser: str, tmp_path: Path) -> None:
-    found = browse(browser, page_of(results), tmp_path, CHOOSE + FILTERED)
-    assert found == {"all": 10, "tank": 4, "methods": 3, "failed": 1, "good": 3, "said": "3 of 10 rows"}
-
-
-DRAWN = """
-choose("group", "1");
-const answer = { fronts: {} };
-const wanted = ["fit_seconds", "storage_bytes"].flatMap(x => ["psnr", "lpips"].flatMap(
-  y => ["all scenes", "bowl"].map(scene => [x, y, scene])));
-for (const [x, y, scene] of wanted) {
-  choose("cost-x", x); choose("cost-y", y); choose("cost-scene", scene);
-  answer.fronts[[x, y, scene].join(" ")] = document.getElementById("cost").front;
-}
-choose("cost-y", "psnr");
-await new Promise(resolve => setTimeout(resolve, 300));
-answer.marks = document.querySelectorAll("#cost .scatterlayer .point").length;
-answer.lines = document.querySelectorAll("#anytime .scatterlayer .js-line").length;
-choose("anytime-scene", "tank");
-await new Promise(resolve => setTimeout(resolve, 300));
-answer.seeds = document.querySelectorAll("#anytime .scatterlayer .js-line").length;
-const picture = await Plotly.toImage("anytime", { format: "png", width: 300, height: 200 });
-const image = new Image(); image.src = picture; await image.decode();
-const canvas = Object.assign(document.createElement("canvas"), { width: 300, height: 200 });
-const pen = canvas.getContext("2d");
-pen.drawImage(image, 0, 0);
-answer.colours = new Set(new Uint32Array(pen.getImageData(0, 0, 300, 200).data.buffer)).size;
-answer.cards = [...document.querySelectorAll(".card dd")].map(cell => cell.firstChild.textContent);
-return answer;
-"""
-
-
-def test_charts_are_drawn_and_their_front_is_the_pareto_front(results: Path, browser: str, tmp_path: Path) -> None:
-    page = page_of(results)
-    found = browse(browser, page, tmp_path, CHOOSE + DRAWN)
-    data = data_of(page)
-    for choice, front in found["fronts"].items():
-        x, y, scene = choice.split(" ", 2)
-        points = {}
-        for label, entry in data["groups"][1]["estimates"].items():
-            runs = [r for r in data["runs"] if r["group"] == 1 and r["label"] == label and r["scene"] == scene]
-            if scene == "all scenes" and x in entry["figures"]:
-                points[label] = [entry["figures"][name]["value"] for name in (x, y)]
-            elif runs and x in runs[0]["figures"]:
-                points[label] = [float(np.median([r["figures"][name] for r in runs])) for name in (x, y)]
-        sign = np.array([1 if data["metrics"][name]["better"] == "lower" else -1 for name in (x, y)])
-        kept = pareto_mask(np.array(list(points.values())) * sign)
-        assert set(front) == {label for label, keep in zip(points, kept) if keep}, choice
-    assert found["marks"] == 3
-    assert found["lines"] >= 3
-    assert found["seeds"] == 6
-    assert found["colours"] > 20
-    assert found["cards"][0].startswith("fast, 22.55")
-
-
-DETAILS = """
-const row = [...document.querySelectorAll("#rows tbody tr")].find(
-  row => row.cells[1].textContent === "fast" && row.cells[0].textContent === "bowl");
-const open = row.cells[0].querySelector("button");
-open.focus();
-const focused = document.activeElement === open;
-open.click();
-const box = document.getElementById("details");
-const text = box.textContent, shown = box.open;
-document.getElementById("details-close").click();
-return { focused, text, shown, closed: !box.open, stages: box.querySelectorAll(".stages span").length };
-"""
-
-
-def test_a_row_opens_its_command_and_record(results: Path, browser: str, tmp_path: Path) -> None:
-    found = browse(browser, page_of(results), tmp_path, DETAILS)
-    assert found["focused"]
-    assert found["shown"]
-    assert found["closed"]
-    assert (
-        "splashbench run fast scenes/bowl OUT --preset best --seed 1 --checkpoints --set iterations=7" in found["text"]
-    )
-    assert "told: times" in found["text"]
-    assert found["stages"] == 4
-
-
-def test_strangers_names_are_shown_as_text(make_result: Any, browser: str, tmp_path: Path) -> None:
-    hostile = "</script><img src=x onerror=\"faults.push('ran')\"><b>"
-    for method in ("alpha", "beta"):
-        make_result(
-            method, scene=hostile, psnr=20.0, fit_seconds=9.0, checkpoints=course((5.0, 3.0)), notes={"a": hostile}
-        ).save(tmp_path / "results")
-    script = """document.querySelector("#rows tbody button").click();
-    await new Promise(resolve => setTimeout(resolve, 300));
-    return { images: document.querySelectorAll("img").length, bold: document.querySelectorAll("b").length,
-      text: document.querySelector("#rows tbody tr").cells[0].textContent };"""
-    assert browse(browser, page_of(tmp_path / "results"), tmp_path, script) == {
-        "images": 0,
-        "bold": 0,
-        "text": hostile,
-    }
-
-
-def test_the_dark_page_is_dark_and_its_picture_is_not_empty(results: Path, browser: str, tmp_path: Path) -> None:
-    script = "return getComputedStyle(document.body).backgroundColor;"
-    light = browse(browser, page_of(results), tmp_path, script)
-    dark = browse(browser, page_of(results), tmp_path, script, "--blink-settings=preferredColorScheme=0")
-    assert light == "rgb(255, 255, 255)"
-    assert dark == "rgb(20, 23, 26)"
-    shot = tmp_path / "shot.png"
-    words = ["--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1200,1600", "--virtual-time-budget=5000"]
-    subprocess.run(
-        [
-            browser,
-            *words,
-            f"--user-data-dir={tmp_path / 'p'}",
-            f"--screenshot={shot}",
-            (tmp_path / "page.html").as_uri(),
-        ],
-        capture_output=True,
-        timeout=120,
-        check=True,
-    )
-    assert read_image(shot)[400:1400].std() > 10
-
-
-def test_the_paper_stands_apart_and_hollow(results: Path, browser: str, tmp_path: Path) -> None:
-    script = 'return document.getElementById("paper").data.map(trace => trace.marker.symbol);'
-    symbols = browse(browser, page_of(results, with_paper=True), tmp_path, script)
-    assert len(symbols) >= 4
-    assert all(symbol.endswith("-open") for symbol in symbols)
-
-
-def test_the_committed_page_is_what_its_results_give() -> None:
+def test_the_committed_page_is_what_its_results_give(data_of: DataOf) -> None:
     folder = Path(__file__).parents[2] / "leaderboards" / "told_nothing"
     if not folder.is_dir():
         pytest.skip("the page of the project's runs lies in its repository alone")

@@ -10,7 +10,7 @@ import pytest
 from splashbench.files import image_size
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.results import ResultFile, load_results
-from splashbench.report.speed_accuracy import machines, pareto_front, reported_machine, summarize
+from splashbench.report.speed_accuracy import ChartedMethod, Dot, machines, pareto_front, reported_machine
 from splashbench.report.table import leaderboard_table
 from splashbench.report.table_markdown import to_markdown
 
@@ -21,14 +21,29 @@ def test_pareto_front_keeps_what_nothing_beats_in_both() -> None:
     assert pareto_front(points, higher_is_better=False) == [(1.0, 5.0), (2.0, 4.0)]
 
 
+def test_pareto_front_by_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        points = [(float(x), float(y)) for x, y in rng.integers(0, 6, size=(rng.integers(1, 25), 2))]
+        front = pareto_front(points, higher_is_better=False)
+        beaten = {p for p in points if any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points)}
+        assert front == sorted(set(points) - beaten)
+
+
 def test_summary_is_the_interquartile_mean_with_an_interval_around_it() -> None:
-    values = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1000.0])
-    summary = summarize(np.stack([np.log10([10.0] * 8), values], axis=1))
-    assert summary.value == pytest.approx(3.5)
-    assert summary.seconds == pytest.approx(10.0)
-    assert summary.value_interval is not None
-    assert summary.value_interval[0] < 3.5 < summary.value_interval[1]
-    assert summarize(np.array([[1.0, 2.0], [1.0, 4.0]])).value_interval is None
+    values = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1000.0]
+    method = ChartedMethod("a", dots=[Dot(10.0, {"psnr": value}, None, "bowl") for value in values])
+    summary = method.summary("psnr")
+    assert summary is not None
+    assert summary.value.value == pytest.approx(3.5)
+    assert summary.seconds.value == pytest.approx(10.0)
+    assert summary.value.interval is not None
+    assert summary.value.interval[0] < 3.5 < summary.value.interval[1]
+    method.dots = method.dots[:4]
+    few = method.summary("psnr")
+    assert few is not None
+    assert few.value.interval is None
+    assert method.summary("lpips") is None
 
 
 def test_runs_are_sorted_into_machines_methods_controls_and_failures(folder: Path, make_result: Any) -> None:

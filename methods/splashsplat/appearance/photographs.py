@@ -26,16 +26,18 @@ Photograph = WindowPhotograph | Deferred
 
 
 class Shelf:
-    """Takes photographs as they come, and keeps the first ones as far as there is room."""
+    """Room for the photographs that are kept: the first ones."""
 
     def __init__(self, room: int = KEPT_BYTES) -> None:
         self._room = room
 
-    def put(self, read: Callable[[], WindowPhotograph]) -> Photograph:
-        """What `read` reads, or a note to read it later."""
-        if self._room <= 0:
-            return Deferred(read)
-        photograph = read()
+    @property
+    def full(self) -> bool:
+        """Whether there is no room left: photographs are to be `Deferred` from now on."""
+        return self._room <= 0
+
+    def keep(self, photograph: WindowPhotograph) -> WindowPhotograph:
+        """`photograph`, which takes up room."""
         self._room -= photograph.image.nbytes + photograph.mask.nbytes
         return photograph
 

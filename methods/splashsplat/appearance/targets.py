@@ -23,7 +23,7 @@ from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import WindowPhotograph
-from .photographs import Photograph, Shelf
+from .photographs import Deferred, Photograph, Shelf
 
 SilhouetteNorm = Literal["image", "window", "mask"]
 
@@ -95,12 +95,21 @@ def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) 
 
 
 def _photograph(
-    scene: TrainingScene, name: str, t: int, part: tuple[slice, slice], at: tuple[int, int]
+    scene: TrainingScene,
+    name: str,
+    t: int,
+    part: tuple[slice, slice],
+    at: tuple[int, int],
+    mask: np.ndarray | None = None,
 ) -> WindowPhotograph:
-    """The `part` of a photograph and its mask, which begins at column and row `at` of the window."""
+    """The `part` of a photograph and its mask, which begins at column and row `at` of the window.
+
+    mask: where it was read already.
+    """
+    mask = scene.mask(name, t) if mask is None else mask
     return WindowPhotograph(
         torch.from_numpy(scene.image(name, t)[part].copy()),
-        torch.from_numpy(scene.mask(name, t)[part].copy()),
+        torch.from_numpy(mask[part].copy()),
         top=at[1],
         left=at[0],
     )
@@ -168,7 +177,12 @@ def collect_targets(
             if even:
                 x0, y0 = x0 - x0 % 2, y0 - y0 % 2
             part = slice(box[1], box[3]), slice(box[0], box[2])
-            photograph = shelf.put(functools.partial(_photograph, scene, name, t, part, (box[0] - x0, box[1] - y0)))
+            at = (box[0] - x0, box[1] - y0)
+            photograph = (
+                Deferred(functools.partial(_photograph, scene, name, t, part, at))
+                if shelf.full
+                else shelf.keep(_photograph(scene, name, t, part, at, mask))
+            )
             background = torch.from_numpy(backgrounds[name])
             share, in_front = (None if cut is None else cut(name, positions)) or (None, None)
             targets.append(

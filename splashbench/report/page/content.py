@@ -14,7 +14,6 @@ from typing import Any
 import pandas as pd
 
 from splashbench.report.anytime import (
-    BUDGETS,
     QUALITY,
     before,
     by_scene,
@@ -175,10 +174,18 @@ def run_facts(result: Result, group: int, label: str, scene: str, path: str) -> 
 
 
 def command(result: Result) -> str:
-    """The command that makes the run again, as far as a result tells it."""
+    """The command that makes the run again, as far as a result tells it: not where files of the method lay."""
+    scene, settings = f"scenes/{result.scene}", result.settings
     if result.method == "oracle":
-        return f"splashbench run oracle {shlex.quote(f'scenes/{result.scene}')} OUT"
-    parts = ["splashbench", "run", result.method, f"scenes/{result.scene}", "OUT"]
+        return shlex.join(["splashbench", "run", "oracle", scene, "OUT"])
+    if "format" in settings and ("command" in settings or "trained" in settings):
+        parts = ["splashbench", "run-external", scene, "OUT", "--name", result.method, "--seed", str(result.seed)]
+        options = {"format": "format", "command": "command", "render_command": "render-command", "importer": "import"}
+        for name, option in options.items():
+            if name in settings:
+                parts += [f"--{option}", str(settings[name])]
+        return shlex.join(parts)
+    parts = ["splashbench", "run", result.method, scene, "OUT"]
     parts += ["--preset", result.preset, "--seed", str(result.seed)]
     if result.withheld:
         parts += ["--withhold", result.withheld]
@@ -229,7 +236,3 @@ def distinct_settings(results: Iterable[Result]) -> dict[str, Mapping[str, Any]]
 def rounded(value: float) -> float | None:
     """`value` to six significant digits; None for what is no number, which JSON cannot hold."""
     return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
-
-
-#: Budgets of the standings, for the script.
-BUDGET_SECONDS = list(BUDGETS)

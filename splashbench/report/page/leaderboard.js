@@ -62,7 +62,7 @@ function drawCards() {
     const card = element("div", null, { class: "card" });
     card.append(element("h3", seconds(budget)));
     const list = element("dl");
-    for (const name of ["psnr", "lpips", "miou"]) {
+    for (const name of data.quality) {
       const standing = chosen.standings[name][n];
       if (!standing || !standing.ranking.length) continue;
       const best = standing.ranking[0];
@@ -72,7 +72,7 @@ function drawCards() {
       if (lead) {
         const second = standing.ranking[1].label, by = number(Math.abs(lead.difference.value), decimals(name));
         const sure = lead.probability === null ? "too few scenes to tell" : `ahead in ${Math.round(100 * lead.probability)} % of resamplings`;
-        cell.append(element("span", `${lead.difference.value >= 0 ? "by" : "behind on common scenes by"} ${by} before ${second}: ${sure}`, { class: "sure" }));
+        cell.append(element("span", `${lead.difference.value >= 0 ? `by ${by} before ${second}` : `yet its plain mean is ${by} behind that of ${second}`}: ${sure}`, { class: "sure" }));
       } else cell.append(element("span", standing.ranking.length > 1 ? `no scene in common with ${standing.ranking[1].label}` : "no other has a state by then", { class: "sure" }));
       list.append(cell);
     }
@@ -86,7 +86,7 @@ function drawCards() {
 
 function drawAnytime() {
   const chosen = group(), name = byId("anytime-metric").value, scene = byId("anytime-scene").value;
-  const traces = [], place = { psnr: 1, lpips: 2, miou: 3 }[name];
+  const traces = [], place = data.quality.indexOf(name) + 1; // after the seconds
   if (scene === ALL) {
     for (const curve of chosen.curves[name]) {
       const { colour, dash } = look(curve.label);
@@ -309,7 +309,7 @@ fill(byId("group"), data.groups.map((g, n) => [n, `${g.machine} · protocol ${g.
 // The group with the most runs comes first to the eye.
 const runsOf = g => Object.values(g.estimates).reduce((sum, entry) => sum + entry.runs, 0);
 byId("group").value = String(data.groups.reduce((best, g, n) => runsOf(g) > runsOf(data.groups[best]) ? n : best, 0));
-fill(byId("anytime-metric"), ["psnr", "lpips", "miou"].map(n => [n, data.metrics[n].title]), "psnr");
+fill(byId("anytime-metric"), data.quality.map(n => [n, data.metrics[n].title]), data.quality[0]);
 fill(byId("cost-x"), data.costs.map(n => [n, data.metrics[n].title]), "fit_seconds");
 fill(byId("cost-y"), data.qualities.map(n => [n, data.metrics[n].title]), "psnr");
 for (const name of ["scene", "method", "preset", "machine", "told", "status"]) {

@@ -9,9 +9,9 @@ from typing import Any
 import pandas as pd
 
 from splashbench.pages import render
-from splashbench.report.groups import entry_key, groups, labels, told_text
+from splashbench.report.anytime import BUDGETS, QUALITY
+from splashbench.report.groups import groups
 from splashbench.report.page.content import (
-    BUDGET_SECONDS,
     COSTS,
     QUALITIES,
     TABLE,
@@ -44,28 +44,23 @@ def leaderboard_page(
     from plotly.offline import get_plotlyjs
 
     found = groups(sources)
-    by_group = {(g.machine, g.protocol, g.told_text): n for n, g in enumerate(found)}
-    names = {
-        n: labels(result for entry in [*g.entries, *g.controls] for result in entry.results)
-        for n, g in enumerate(found)
+    # Not by digests: one submission may have been scored by two protocols.
+    place = {
+        id(result): (n, entry.label)
+        for n, group in enumerate(found)
+        for entry in (*group.entries, *group.controls)
+        for result in entry.results
     }
-
-    def place(result: Any) -> tuple[int, str]:
-        n = by_group[result.hardware_label, result.protocol_label, told_text(result.told)]
-        return n, names[n][entry_key(result)]
-
     scenes = [group.scenes for group in found]
     runs = []
     for source in sources:
-        group, label = place(source.result)
-        scene = scenes[group][source.result.digests.scene]
-        runs.append(run_facts(source.result, group, label, scene, source.path))
+        n, label = place[id(source.result)]
+        runs.append(run_facts(source.result, n, label, scenes[n][source.result.digests.scene], source.path))
     for run in runs:
         run["sheet"] = (sheets or {}).get(run["file"])
-    # Not by digests: one submission may have been scored by two protocols.
     number = {id(source.result): n for n, source in enumerate(sources)}
     rows = [
-        row_facts(row, *place(row["results"][0]), [number[id(result)] for result in row["results"]])
+        row_facts(row, *place[id(row["results"][0])], [number[id(result)] for result in row["results"]])
         for _, row in table.iterrows()
     ]
     data = {
@@ -73,7 +68,8 @@ def leaderboard_page(
         "columns": list(TABLE),
         "costs": list(COSTS),
         "qualities": list(QUALITIES),
-        "budgets": BUDGET_SECONDS,
+        "budgets": list(BUDGETS),
+        "quality": list(QUALITY),
         "groups": [group_facts(group) for group in found],
         "runs": runs,
         "rows": rows,

@@ -6,7 +6,7 @@ import torch
 
 from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance.coarse import with_half_size
-from splashbench_methods.splashsplat.appearance.photographs import ReadAhead, Shelf, read_now
+from splashbench_methods.splashsplat.appearance.photographs import Deferred, ReadAhead, Shelf, read_now
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
 
@@ -128,7 +128,7 @@ def test_photographs_beyond_the_room_are_read_again_each_time() -> None:
 
     # A photograph has 80 bytes: with room for 100, two are kept.
     shelf = Shelf(room=100)
-    photographs = [shelf.put(reading(n)) for n in range(4)]
+    photographs = [Deferred(reading(n)) if shelf.full else shelf.keep(reading(n)()) for n in range(4)]
     assert read == [0, 1]
     reader = ReadAhead()
     for n in (2, 0, 3, 2):
