@@ -3,7 +3,7 @@
 Needs no torch. The kernels are compiled at first use (a few seconds) and cached.
 """
 
-from splashbench.observe.failures import distrust_failed_masks
+from splashbench.observe.failures import distrust_failed_masks, trusted_bounds
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import sequence_bounds
 from splashbench.observe.initial_points import initial_points
@@ -26,4 +26,5 @@ __all__ = [
     "sequence_bounds",
     "signed_distance_fields",
     "signed_distance_frames",
+    "trusted_bounds",
 ]

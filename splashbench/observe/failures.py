@@ -11,7 +11,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from splashbench.observe.grid import Grid
+from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_views, sequence_bounds
 from splashbench.observe.occlusion import CarvingOcclusion, ContainerOcclusion, focal_length
 from splashbench.observe.silhouettes import Silhouettes
@@ -37,25 +37,32 @@ def distrust_failed_masks(silhouettes: Silhouettes, container: ContainerOcclusio
     Returns those masks, bool [T, V]. Raises SplashbenchError when the masks have no common hull.
     """
     before = silhouettes.failed_masks.copy()
+    trusted_bounds(silhouettes, container)
+    return silhouettes.failed_masks & ~before
+
+
+def trusted_bounds(silhouettes: Silhouettes, container: ContainerOcclusion | None = None) -> Bounds:
+    """Do what `distrust_failed_masks` does; returns the `sequence_bounds` by what is trusted then."""
     for _ in range(_ROUNDS):
-        missing = missing_shares(silhouettes, container)
+        bounds = sequence_bounds(silhouettes, container)
+        missing = missing_shares(silhouettes, container, bounds)
         usual = np.median(missing, axis=0)
         spread = 1.4826 * np.median(np.abs(missing - usual), axis=0)
         failed = missing > usual + np.maximum(_MISSING_SHARE + usual, _DEVIATIONS * spread)
         failed &= silhouettes.sees_liquid & ~silhouettes.failed_masks
         if not failed.any():
-            break
+            return bounds
         silhouettes.distrust(failed)
-    return silhouettes.failed_masks & ~before
+    return sequence_bounds(silhouettes, container)
 
 
-def missing_shares(silhouettes: Silhouettes, container: ContainerOcclusion | None = None) -> np.ndarray:
+def missing_shares(silhouettes: Silhouettes, container: ContainerOcclusion | None, bounds: Bounds) -> np.ndarray:
     """Estimated share of the liquid that each mask misses: float64 [T, V], 0 in frames without a hull.
 
     Of a mask that is replaced only what is certain counts (`Silhouettes.certain_mask`): a hull that is too large would
-    accuse the other masks.
+    accuse the other masks. bounds: `sequence_bounds` of both.
     """
-    grid = Grid.over(sequence_bounds(silhouettes, container), _CELLS)
+    grid = Grid.over(bounds, _CELLS)
     # What one view alone sees is as long as its rays: it would accuse the masks of all others.
     carving = None if container is None else CarvingOcclusion(container, silhouettes, grid, witnesses=2)
     patches = [_Patches(camera, grid, carving, view) for view, camera in enumerate(silhouettes.cameras)]

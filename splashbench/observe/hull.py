@@ -13,13 +13,22 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Bounds, Grid
-from splashbench.observe.kernels import carve_view
+from splashbench.observe.kernels import carve_view, fill_blocks
 from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion, focal_length
 from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
 from splashbench.parallel import each
 
 SEARCH_CELLS = 64
 REFINED_CELLS = 96
+
+# Nodes along the edge of a block, and along a grid's shortest side from which blocks are worth it.
+_BLOCK = 4
+_WORTH_BLOCKS = 48
+# By how much a node may be less outside than the corners of its block, voxels: over the block's diagonal, distances
+# change by no more than 1.5 voxels a voxel, where views are no wider than 90 degrees.
+_REACH = 1.5 * 3**0.5 * _BLOCK
+# What is told apart at corners, in voxels of their grid.
+_FARTHEST = (LIMIT_VOXELS + _REACH) / _BLOCK + 1
 
 #: the 2-D signed distance s_v of view number v, of a window of its image
 Distance = Callable[[int, ImageWindow | None], np.ndarray]
@@ -30,11 +39,30 @@ def carve(
 ) -> np.ndarray:
     """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v."""
     phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32) if container is None else container.outside.copy()
-    for carve_with in each(
-        lambda view: _carver(silhouettes, view, distance, container), range(len(silhouettes.cameras))
-    ):
-        carve_with(phi, grid)
+    carvers = each(lambda view: _Carver(silhouettes, view, distance, container), range(len(silhouettes.cameras)))
+    if min(grid.shape) >= _WORTH_BLOCKS:
+        fill_blocks(phi, _far_blocks(grid, carvers), _BLOCK, LIMIT_VOXELS)
+    for carver in carvers:
+        carver.carve(phi, grid)
     return phi
+
+
+def _far_blocks(grid: Grid, carvers: list[_Carver]) -> np.ndarray:
+    """The blocks in which every node is LIMIT_VOXELS or more outside: bool [bx, by, bz].
+
+    Told from their corners, on a grid that is so much coarser. Most nodes are in such blocks, and need no look of
+    their own.
+    """
+    nx, ny, nz = (-(-n // _BLOCK) + 1 for n in grid.shape)
+    corners = Grid(grid.origin, grid.voxel * _BLOCK, (nx, ny, nz))
+    phi = np.full(corners.shape, -_FARTHEST, dtype=np.float32)
+    for carver in carvers:
+        carver.carve_least(phi, corners)
+    far = phi * _BLOCK >= LIMIT_VOXELS + _REACH
+    for axis in range(3):
+        count = far.shape[axis] - 1
+        far = np.take(far, range(count), axis=axis) & np.take(far, range(1, count + 1), axis=axis)
+    return far
 
 
 def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None = None) -> np.ndarray:
@@ -48,32 +76,47 @@ def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: Carving
     """What each view alone is certain of in frame `t`: float32 [V, nx, ny, nz] in voxels, < 0 in its silhouette."""
     views = np.full((len(silhouettes.cameras), *grid.shape), -LIMIT_VOXELS, dtype=np.float32)
     carvers = each(
-        lambda view: _carver(
+        lambda view: _Carver(
             silhouettes, view, lambda v, window: silhouettes.certain_distance(v, t, window), container
         ),
         range(len(views)),
     )
-    for phi, carve_with in zip(views, carvers):
-        carve_with(phi, grid)
+    for phi, carver in zip(views, carvers):
+        carver.carve(phi, grid)
     return views
 
 
-def _carver(
-    silhouettes: Silhouettes, view: int, distance: Distance, container: CarvingOcclusion | None
-) -> Callable[[np.ndarray, Grid], None]:
-    """What view number `view` says, as a function of phi and its grid: phi = max(phi, that), in place."""
-    if container is not None and container.views:
-        occlusion = container.views[view]
-        evidence = occlusion.evidence(distance(view, occlusion.window))
-        return lambda phi, grid: occlusion.carve(phi, grid, evidence)
-    camera, corner = silhouettes.cameras[view], silhouettes.windows[view].corner
-    silhouette = distance(view, None)
+class _Carver:
+    """What view number `view` says; `distance` gives s_v."""
 
-    def carve_with(phi: np.ndarray, grid: Grid) -> None:
-        focal = focal_length(camera)
-        carve_view(phi, grid.origin, grid.voxel, camera.projection, focal, silhouette, corner, LIMIT_VOXELS)
+    def __init__(
+        self, silhouettes: Silhouettes, view: int, distance: Distance, container: CarvingOcclusion | None
+    ) -> None:
+        self._camera, self._corner = silhouettes.cameras[view], silhouettes.windows[view].corner
+        self._occlusion = container.views[view] if container is not None and container.views else None
+        if self._occlusion is None:
+            self._evidence = distance(view, None)
+        else:
+            self._evidence = self._occlusion.evidence(distance(view, self._occlusion.window))
 
-    return carve_with
+    def carve(self, phi: np.ndarray, grid: Grid) -> None:
+        """phi = max(phi, that), in place, in voxels of `grid`."""
+        if self._occlusion is None:
+            self._carve_seen(phi, grid, LIMIT_VOXELS)
+        else:
+            self._occlusion.carve(phi, grid, self._evidence)
+
+    def carve_least(self, phi: np.ndarray, grid: Grid) -> None:
+        """As `carve`, with the least that is said at any place no deeper than a node."""
+        if self._occlusion is None:
+            self._carve_seen(phi, grid, _FARTHEST)
+        else:
+            self._occlusion.carve_least(phi, grid, self._evidence, _FARTHEST)
+
+    def _carve_seen(self, phi: np.ndarray, grid: Grid, limit: float) -> None:
+        camera = self._camera
+        place = (grid.origin, grid.voxel, camera.projection, focal_length(camera))
+        carve_view(phi, *place, self._evidence, self._corner, limit)
 
 
 def _inside(phi: np.ndarray, grid: Grid, tolerance: float) -> Bounds | None:

@@ -70,6 +70,27 @@ def resample(field: np.ndarray, shape: tuple[int, int, int], ratio: float) -> np
     return out
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _projected(projection: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Homogeneous pixel coordinates of a point."""
+    return (
+        projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3],
+        projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3],
+        projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3],
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _bilinear(image: np.ndarray, u: float, v: float) -> float:
+    """Value of `image` [h, w] at column `u` and row `v`, within it."""
+    column = min(int(u), image.shape[1] - 2)
+    row = min(int(v), image.shape[0] - 2)
+    a = u - column
+    above = image[row, column] + (image[row, column + 1] - image[row, column]) * a
+    below = image[row + 1, column] + (image[row + 1, column + 1] - image[row + 1, column]) * a
+    return above + (below - above) * (v - row)
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carve_view(
     phi: np.ndarray,
@@ -85,35 +106,30 @@ def _carve_view(
 ) -> None:
     _, ny, nz = phi.shape
     height, width = silhouette.shape
+    right, bottom, per_voxel = width - 1.0, height - 1.0, 1.0 / (focal * voxel)
+    du, dv, ddepth = projection[0, 2] * voxel, projection[1, 2] * voxel, projection[2, 2] * voxel
     for i in range(start, stop):
         x = origin[0] + i * voxel
         for j in range(ny):
             y = origin[1] + j * voxel
+            first_u, first_v, first_depth = _projected(projection, x, y, origin[2])
             for k in range(nz):
                 if phi[i, j, k] >= limit:
                     continue
-                z = origin[2] + k * voxel
-                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+                depth = first_depth + k * ddepth
                 if depth <= 0.0:
                     phi[i, j, k] = limit
                     continue
-                u = projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]
-                v = projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]
                 # Pixel (row, column) is centred at (column + 0.5, row + 0.5).
-                u = u / depth - 0.5 - corner[0]
-                v = v / depth - 0.5 - corner[1]
-                inside_u = min(max(u, 0.0), width - 1.0)
-                inside_v = min(max(v, 0.0), height - 1.0)
-                column = min(int(inside_u), width - 2)
-                row = min(int(inside_v), height - 2)
-                a = inside_u - column
-                b = inside_v - row
-                pixels = (silhouette[row, column] * (1 - a) + silhouette[row, column + 1] * a) * (1 - b) + (
-                    silhouette[row + 1, column] * (1 - a) + silhouette[row + 1, column + 1] * a
-                ) * b
-                pixels += np.sqrt((u - inside_u) ** 2 + (v - inside_v) ** 2)
-                distance = min(max(pixels * depth / (focal * voxel), -limit), limit)
-                phi[i, j, k] = max(phi[i, j, k], distance)
+                nearness = 1.0 / depth
+                u = (first_u + k * du) * nearness - 0.5 - corner[0]
+                v = (first_v + k * dv) * nearness - 0.5 - corner[1]
+                inside_u = min(max(u, 0.0), right)
+                inside_v = min(max(v, 0.0), bottom)
+                pixels = _bilinear(silhouette, inside_u, inside_v)
+                if inside_u != u or inside_v != v:
+                    pixels += np.sqrt((u - inside_u) ** 2 + (v - inside_v) ** 2)
+                phi[i, j, k] = max(phi[i, j, k], min(max(pixels * depth * per_voxel, -limit), limit))
 
 
 def carve_view(
@@ -166,43 +182,42 @@ def _carve_hidden_view(
 ) -> None:
     _, ny, nz = phi.shape
     last, height, width = layers.shape[0] - 1, layers.shape[1], layers.shape[2]
+    right, bottom, per_voxel = width - 1.0, height - 1.0, 1.0 / (focal * voxel)
+    du, dv, ddepth = projection[0, 2] * voxel, projection[1, 2] * voxel, projection[2, 2] * voxel
     counting = witnesses.shape[1] > 0
     for i in range(start, stop):
         x = origin[0] + i * voxel
         for j in range(ny):
             y = origin[1] + j * voxel
+            first_u, first_v, first_depth = _projected(projection, x, y, origin[2])
+            at = 0
             for k in range(nz):
                 if not counting and phi[i, j, k] >= limit:
                     continue
-                z = origin[2] + k * voxel
-                depth = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+                depth = first_depth + k * ddepth
                 if depth <= 0.0:
                     if not counting:
                         phi[i, j, k] = limit
                     continue
-                u = projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]
-                v = projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]
-                u = u / depth - 0.5 - corner[0]
-                v = v / depth - 0.5 - corner[1]
-                inside_u = min(max(u, 0.0), width - 1.0)
-                inside_v = min(max(v, 0.0), height - 1.0)
-                beyond = np.sqrt((u - inside_u) ** 2 + (v - inside_v) ** 2)
+                nearness = 1.0 / depth
+                u = (first_u + k * du) * nearness - 0.5 - corner[0]
+                v = (first_v + k * dv) * nearness - 0.5 - corner[1]
+                inside_u = min(max(u, 0.0), right)
+                inside_v = min(max(v, 0.0), bottom)
                 reach = depth - tolerance
-                layer = 0
-                while layer < last and starts[layer] <= reach:
-                    layer += 1
+                # Depths change little from node to node: the search for the layer goes on where it ended.
+                while at < last and starts[at] <= reach:
+                    at += 1
+                while at > 0 and starts[at - 1] > reach:
+                    at -= 1
+                layer, beyond = at, 0.0
+                if inside_u != u or inside_v != v:
+                    beyond = np.sqrt((u - inside_u) ** 2 + (v - inside_v) ** 2)
                 # The nearest layer that hides no more than is hidden at this depth, or no less: either keeps the sign.
-                if beyond == 0.0 and nearest[int(inside_v + 0.5), int(inside_u + 0.5)] < reach and layer < last:
+                elif layer < last and nearest[int(inside_v + 0.5), int(inside_u + 0.5)] < reach:
                     layer += 1
-                column = min(int(inside_u), width - 2)
-                row = min(int(inside_v), height - 2)
-                a = inside_u - column
-                b = inside_v - row
-                image = layers[layer]
-                pixels = (image[row, column] * (1 - a) + image[row, column + 1] * a) * (1 - b) + (
-                    image[row + 1, column] * (1 - a) + image[row + 1, column + 1] * a
-                ) * b
-                distance = min(max((pixels + beyond) * depth / (focal * voxel), -limit), limit)
+                pixels = _bilinear(layers[layer], inside_u, inside_v)
+                distance = min(max((pixels + beyond) * depth * per_voxel, -limit), limit)
                 if not counting:
                     phi[i, j, k] = max(phi[i, j, k], distance)
                 elif distance > phi[i, j, k]:
@@ -254,3 +269,19 @@ def carve_hidden_view(
         float(tolerance),
         float(limit),
     )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill_blocks(field: np.ndarray, blocks: np.ndarray, size: int, value: float, start: int, stop: int) -> None:
+    _, ny, nz = field.shape
+    for i in range(start, stop):
+        for j in range(ny):
+            for c in range(blocks.shape[2]):
+                if blocks[i // size, j // size, c]:
+                    for k in range(c * size, min((c + 1) * size, nz)):
+                        field[i, j, k] = value
+
+
+def fill_blocks(field: np.ndarray, blocks: np.ndarray, size: int, value: float) -> None:
+    """Set `field` [nx, ny, nz] to `value` in `blocks`, bool [bx, by, bz] of `size` nodes a side, in place."""
+    over_range(_fill_blocks, field.shape[0], field, np.ascontiguousarray(blocks), size, float(value))

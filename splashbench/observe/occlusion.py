@@ -150,20 +150,29 @@ class ViewOcclusion:
 
     def carve(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, second: np.ndarray | None = None) -> None:
         """phi = max(phi, what `layers` say), in place, in voxels of `grid`; see `carve_hidden_view`."""
-        carve_hidden_view(
-            phi,
-            grid.origin,
-            grid.voxel,
-            self.camera.projection,
-            focal_length(self.camera),
-            layers,
-            self.window.corner,
-            self.nearest,
-            self.starts,
-            _TOLERANCE_VOXELS * grid.voxel,
-            LIMIT_VOXELS,
-            second,
-        )
+        tolerance = _TOLERANCE_VOXELS * grid.voxel
+        self._carve(phi, grid, layers, self.nearest, self.starts, tolerance, LIMIT_VOXELS, second)
+
+    def carve_least(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, limit: float) -> None:
+        """As `carve`, with the least that `layers` say at any place no deeper than a node. limit: in voxels."""
+        # A point that is hidden at its own depth looks one layer deeper, and no point looks farther.
+        starts = np.append(-np.inf, self.starts[:-1]) if len(self.starts) else self.starts
+        self._carve(phi, grid, layers, np.full_like(self.nearest, np.inf), starts, 0.0, limit)
+
+    def _carve(
+        self,
+        phi: np.ndarray,
+        grid: Grid,
+        layers: np.ndarray,
+        nearest: np.ndarray,
+        starts: np.ndarray,
+        tolerance: float,
+        limit: float,
+        second: np.ndarray | None = None,
+    ) -> None:
+        camera, corner = self.camera, self.window.corner
+        place = (grid.origin, grid.voxel, camera.projection, focal_length(camera))
+        carve_hidden_view(phi, *place, layers, corner, nearest, starts, tolerance, limit, second)
 
 
 class CarvingOcclusion:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from splashbench.observe.failures import distrust_failed_masks
+from splashbench.observe.failures import trusted_bounds
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_frame, sequence_bounds
 from splashbench.observe.kernels import sample
@@ -105,9 +105,7 @@ def signed_distance_fields(
     Raises SplashbenchError when the masks have no common hull.
     """
     silhouettes = Silhouettes(scene, views)
-    if detect_failed_masks:
-        distrust_failed_masks(silhouettes, container)
-    bounds = sequence_bounds(silhouettes, container)
+    bounds = (trusted_bounds if detect_failed_masks else sequence_bounds)(silhouettes, container)
     grid = Grid.over(bounds.padded(PADDING), cells_longest_axis)
     frames = list(signed_distance_frames(silhouettes, grid, method, container))
     return SignedDistanceFields(grid, bounds, np.stack(frames))

@@ -9,8 +9,17 @@ import pytest
 import trimesh
 
 from splashbench.errors import SplashbenchError
-from splashbench.observe import Bounds, ContainerOcclusion, Grid, Silhouettes, sequence_bounds, signed_distance_fields
+from splashbench.observe import (
+    Bounds,
+    ContainerOcclusion,
+    Grid,
+    Silhouettes,
+    hull,
+    sequence_bounds,
+    signed_distance_fields,
+)
 from splashbench.observe.container import depth_image, hidden, hidden_share, solid_distance
+from splashbench.observe.kernels import fill_blocks
 from splashbench.observe.occlusion import CarvingOcclusion
 from splashbench.scene import Camera, ContainerMesh, look_at
 
@@ -249,6 +258,23 @@ def test_carving_around_a_container_does_not_depend_on_threads(wall: ContainerOc
     shared = signed_distance_fields(BallBehindAWall(), 40, container=wall)
     monkeypatch.setattr(parallel, "thread_count", lambda: 1)
     np.testing.assert_array_equal(signed_distance_fields(BallBehindAWall(), 40, container=wall).phi, shared.phi)
+
+
+@pytest.mark.parametrize("occluded", [False, True])
+def test_blocks_that_are_far_outside_are_told_from_their_corners(
+    wall: ContainerOcclusion, monkeypatch: pytest.MonkeyPatch, occluded: bool
+) -> None:
+    # Small beside its grid, which is not of whole blocks, and with a wall thinner than one.
+    silhouettes = Silhouettes(BallBehindAWall())
+    grid = Grid.over(Bounds(np.full(3, -1.1), np.array([1.1, 0.9, 1.0])), 90)
+    carving = CarvingOcclusion(wall, silhouettes, grid) if occluded else None
+    filled = []
+    monkeypatch.setattr(hull, "fill_blocks", lambda *given: (filled.append(given[1].mean()), fill_blocks(*given)))
+    by_blocks = hull.carve_frame(silhouettes, grid, 0, carving)
+    assert 0.2 < filled[0] < (by_blocks == 20).mean() < 1
+    monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1000)
+    np.testing.assert_array_equal(hull.carve_frame(silhouettes, grid, 0, carving), by_blocks)
+    assert len(filled) == 1
 
 
 def test_a_container_out_of_sight_changes_nothing() -> None:

@@ -69,7 +69,8 @@ def test_a_cut_mask_is_found_and_replaced_and_no_other() -> None:
     found = distrust_failed_masks(silhouettes)
     assert sorted(map(tuple, np.argwhere(found).tolist())) == [(4, 1), (6, 3)]
     assert silhouettes.failed(4) == ["1"]
-    assert (missing_shares(Silhouettes(scene))[[4, 6], [1, 3]] > 0.2).all()
+    anew = Silhouettes(scene)
+    assert (missing_shares(anew, None, sequence_bounds(anew))[[4, 6], [1, 3]] > 0.2).all()
     # The frames before and after stand in, and the ball is whole again.
     replaced = silhouettes.evidence_mask(1, 4)
     whole = clean.mask(1, 4)

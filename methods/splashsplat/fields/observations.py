@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from splashbench.harness.contract import Run
-from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames
-from splashbench.observe.failures import distrust_failed_masks
+from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
 from splashbench.observe.grid import Bounds
 from splashbench.observe.kernels import resample
 from splashbench.observe.occlusion import ContainerOcclusion
@@ -192,10 +191,11 @@ def _bounds(
         if settings.detect_failed_masks:
             report(0.0, "looking for failed masks")
             with run.stage("failed masks"):
-                distrust_failed_masks(silhouettes, container)
-        with run.stage("signed distance"):
-            bounds = sequence_bounds(silhouettes, container).padded(PADDING)
-        return silhouettes.failed_masks, bounds
+                bounds = trusted_bounds(silhouettes, container)
+        else:
+            with run.stage("signed distance"):
+                bounds = sequence_bounds(silhouettes, container)
+        return silhouettes.failed_masks, bounds.padded(PADDING)
 
     def save(result: tuple[np.ndarray, Bounds], directory: Path) -> None:
         failed, bounds = result
