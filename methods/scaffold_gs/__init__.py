@@ -1,8 +1,16 @@
 """Static Scaffold-GS anchors: the background of other methods (`fit_background`, `Background`), and a method itself."""
 
-from .background import Background, fit_background
+from .background import Background, fit_background, flat_background
 from .background_reuse import shared_background
 from .method import ScaffoldGS, StaticScene
 from .settings import BackgroundSettings
 
-__all__ = ["Background", "BackgroundSettings", "ScaffoldGS", "StaticScene", "fit_background", "shared_background"]
+__all__ = [
+    "Background",
+    "BackgroundSettings",
+    "ScaffoldGS",
+    "StaticScene",
+    "fit_background",
+    "flat_background",
+    "shared_background",
+]

@@ -137,6 +137,21 @@ def fit_background(
         return Background(supervised_anchors(model, plates), far_color)
 
 
+def flat_background(scene: TrainingScene) -> tuple[Background, dict[str, NDArray[np.float32]]]:
+    """For who cannot wait: a background of one colour, and what lies behind the liquid in each training view.
+
+    That is frame 0 where it is free of liquid, and elsewhere the colour, the median of all that is: float32 [H, W, 3].
+    """
+    plates = {}
+    for name in scene.train:
+        camera = scene.cameras[name]
+        plates[name] = make_clean_plate(scene, name, max(camera.width, camera.height), n_frames=1)
+    seen = np.concatenate([plate.image[plate.seen] for plate in plates.values()])
+    color = (np.median(seen, axis=0) / 255).astype(np.float32) if len(seen) else np.full(3, 0.5, np.float32)
+    behind = {name: np.where(plate.seen[..., None], plate.floats(), color) for name, plate in plates.items()}
+    return Background(AnchorModel(0, StaticAnchorSpec(1)), color), behind
+
+
 def _hull_points(scene: TrainingScene, count: int) -> NDArray[np.float32]:
     """Some `count` points on the liquid's hull, all frames together: float32 [n, 6], positions and colours.
 

@@ -1,7 +1,7 @@
 """Settings of the static background and its presets.
 
 "paper" is the background of SplashSplat (supplement, "Implementation Details") with the constants of Scaffold-GS;
-"best" and "quick" see more of the recording and start from denser anchors, so that far fewer steps do.
+the others see more of the recording and start from denser anchors, so that far fewer steps do.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ class BackgroundSettings(MethodConfig):
             # Published in steps: counted from 500, rounds after 1 500 and before 15 000, rates until 30 000.
             "count_from": 0.025, "grow_from": 0.075, "grow_until": 0.74995,
         },
+        "brief": {"iterations": 500},
         "quick": {"iterations": 400, "max_anchors": 5_000, "longest_side": 400},
     }  # fmt: skip
 

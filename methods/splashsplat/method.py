@@ -22,6 +22,8 @@ from .appearance.decoder import Children
 from .appearance.fitting import composite
 from .carriers.between import carriers_at
 from .carriers.subframe import CarrierState
+from .draft import make_draft
+from .fields.container import known_container
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import metric_gravity
 from .model import Liquid
@@ -153,8 +155,15 @@ class SplashSplat(Method):
             with part.stage("background"), one_torch_thread():
                 return shared_background(scene, config.background, part)
 
+        known = None
+        if run.watched and config.draft_cells > 0:
+            run.progress(0, "draft")
+            with run.stage("draft"):
+                known = known_container(scene, config.container, config.container_masks)
+                draft = FittedSplashSplat(*make_draft(scene, config, run.seed, known))
+            run.checkpoint(lambda: draft, milestone=True)
         background, traced = run.side_by_side(
-            fit_background, lambda part: trace_liquid(scene, config, part), span=(0, _BEFORE)
+            fit_background, lambda part: trace_liquid(scene, config, part, known), span=(0, _BEFORE)
         )
         frozen: dict[str, Frozen] | None = None
         if config.composition == "together":

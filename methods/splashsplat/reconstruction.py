@@ -19,6 +19,7 @@ from splashbench.render import Frozen
 from splashbench.scene.scene import TrainingScene
 
 from .appearance.coarse import with_half_size
+from .appearance.first_look import photographed, take_on
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
 from .appearance.targets import collect_targets
 from .carriers.coverage import uncovered_by_any
@@ -26,6 +27,7 @@ from .carriers.population import Carriers
 from .carriers.subframe import Track
 from .carriers.tracking import CarrierTracker, Simulation, Tracking
 from .carriers.visibility import seen_by_any
+from .fields.container import KnownContainer
 from .fields.observations import Observations, observe
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import FlipSolver, FlipTransport, gravity_in_voxels
@@ -55,9 +57,11 @@ class Traced:
     config: SplashSplatConfig
 
 
-def trace_liquid(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> Traced:
-    """Observe the liquid of `scene` and follow it; needs no background."""
-    observations = observe(scene, config.fields, run, run.progress)
+def trace_liquid(
+    scene: TrainingScene, config: SplashSplatConfig, run: Run, known: KnownContainer | None = None
+) -> Traced:
+    """Observe the liquid of `scene` and follow it; needs no background. known: the container, see `observe`."""
+    observations = observe(scene, config.fields, run, run.progress, known)
     if observations.in_transparent_container:
         config = config.in_transparent_container()
         run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
@@ -243,6 +247,8 @@ def _fit_appearance(
     memory.give_back()
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
+    if config.first_look:
+        take_on(photographed(track, targets), appearance.features, appearance.decoder)
     color_cell = observations.hull_grid.voxel / voxel
     fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer)
     return appearance, fit.left

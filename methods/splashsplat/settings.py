@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from splashbench.harness.contract import MethodConfig
 from splashbench.observe.signed_distance import SignedDistanceMethod
 
 from .appearance.decoder import DecoderSettings, ScaleResidual
+from .appearance.first_look import LEAST_FEATURES, LEAST_HIDDEN
 from .appearance.fitting import Composition, FitSettings
 from .appearance.losses import LossWeights
 from .appearance.targets import SilhouetteNorm
@@ -29,8 +30,11 @@ if TYPE_CHECKING:
     from ..scaffold_gs import BackgroundSettings
 
 
+# Of the draft: what a second or two allow.
+_DRAFT_ITERATIONS = 300
+
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "11"
+VERSION = "12"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -51,6 +55,9 @@ class SplashSplatConfig(MethodConfig):
     container_masks: bool = True
     #: liquid is cut by pixels where the near wall of an opaque container hides it (needs gravity or container masks)
     cut_at_rim: bool = True
+    #: the box of the grids holds every frame's hull, or else the hull of all masks together; where failed masks are
+    #: looked for, always the first
+    tight_bounds: bool = True
     #: look for masks that miss much of the liquid, and replace them
     detect_failed_masks: bool = True
     #: replace empty masks where other views see liquid; in the paper they say that there is none
@@ -137,7 +144,7 @@ class SplashSplatConfig(MethodConfig):
     foreground_weight: float = Field(0.5, ge=0)
     gradient_weight: float = Field(0.1, ge=0)
     ssim_weight: float = Field(0.2, ge=0)
-    silhouette_weight: float = Field(0.2, ge=0)
+    silhouette_weight: float = Field(0.4, ge=0)
     covariance_weight: float = Field(0.01, ge=0)
     separation_weight: float = Field(0.1, ge=0)
     color_weight: float = Field(1.0, ge=0)
@@ -146,12 +153,16 @@ class SplashSplatConfig(MethodConfig):
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
     idle_share: float = Field(0.02, ge=0, le=0.2)
+    #: carriers begin with the colours in which the photographs show them, or else at random as in the paper
+    first_look: bool = True
     #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
     coarse_share: float = Field(0.8, ge=0, le=1)
     #: pixels along the longest side beyond which photographs are large enough for that
     coarse_side: PositiveInt = 1500
     # Background, fitted by scaffold_gs: its preset
-    background_preset: Literal["best", "paper", "quick"] = "best"
+    background_preset: Literal["best", "paper", "brief", "quick"] = "brief"
+    #: hull cells of a draft that is made first where states of the fit are taken (`run --checkpoints`); 0 for none
+    draft_cells: int = Field(80, ge=0, le=512)
 
     renamed: ClassVar[Mapping[str, str]] = {
         "distance": "signed_distance",
@@ -211,7 +222,9 @@ class SplashSplatConfig(MethodConfig):
             "prune_opacity": 0.0,
             "idle_share": 0.0,
             "coarse_share": 0.0,
+            "first_look": False,
             "background_preset": "paper",
+            "draft_cells": 0,
         },
         "quick": {
             "hull_cells": 160,
@@ -227,6 +240,15 @@ class SplashSplatConfig(MethodConfig):
             "background_preset": "quick",
         },
     }
+
+    @model_validator(mode="after")
+    def _room_for_the_first_look(self) -> SplashSplatConfig:
+        if self.first_look and (self.feature_size < LEAST_FEATURES or self.color_width < LEAST_HIDDEN):
+            raise ValueError(
+                f"first_look needs a feature_size of {LEAST_FEATURES} and a color_width of {LEAST_HIDDEN} at least; "
+                "set first_look=false"
+            )
+        return self
 
     @property
     def control_factor(self) -> int:
@@ -253,6 +275,7 @@ class SplashSplatConfig(MethodConfig):
             camera_times=self.camera_times,
             pool=self.pool,
             ballistic=self.ballistic,
+            tight_bounds=self.tight_bounds,
         )
 
     @property
@@ -278,6 +301,28 @@ class SplashSplatConfig(MethodConfig):
     def in_transparent_container(self) -> SplashSplatConfig:
         """The settings where the liquid is in a transparent container."""
         return self.model_copy(update={"shell_depth": min(self.shell_depth, self.clear_shell_depth)})
+
+    def draft(self) -> SplashSplatConfig:
+        """The settings of the draft: coarse carriers of each frame alone, and few iterations."""
+        return self.model_copy(
+            update={
+                "hull_cells": max(16, self.draft_cells),
+                "transport_cells": max(16, self.draft_cells // 2),
+                "control_cells": 4,
+                "detect_failed_masks": False,
+                "tight_bounds": False,
+                "cut_at_rim": False,
+                "pool": False,
+                "ballistic": False,
+                "variant": "per_frame",
+                "interior_per_cell": 1,
+                "shell_depth": 3.0,
+                "still_cell": 0.0,
+                "iterations": _DRAFT_ITERATIONS,
+                "validation_share": 0.0,
+                "idle_share": 0.0,
+            }
+        )
 
     @property
     def carriers(self) -> CarrierSettings:

@@ -1,7 +1,8 @@
 """Checkpoints: states of a fit that is under way, saved outside its clock.
 
 A method offers its state as often as it likes (`Run.checkpoint`). At the marks, the same for every method, the harness
-takes one. Making and saving it are no part of the fit's time, nor of the stage that it falls into.
+takes one, and besides whatever a method calls a milestone. Making and saving them are no part of the fit's time, nor
+of the stage that they fall into.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Checkpoints:
     """Takes the states of one fit, each into a folder of its own below `folder`: 00, 01 and so on.
 
     Attributes:
-        seconds: of the fit, when each state was offered; never before its mark.
+        seconds: of the fit, when each state was offered; never before its mark, unless it is a milestone.
         spent: seconds that making and saving them took.
     """
 
@@ -45,9 +46,9 @@ class Checkpoints:
         self._folder, self._elapsed, self._synchronise = folder, elapsed, synchronise
         self._left = list(reversed(marks))
 
-    def offer(self, state: Callable[[], Savable]) -> None:
-        """Take what `state` makes where a mark has come."""
-        if not self._left or self._elapsed() < self._left[-1]:
+    def offer(self, state: Callable[[], Savable], milestone: bool = False) -> None:
+        """Take what `state` makes where a mark has come, or a `milestone` was reached."""
+        if not milestone and (not self._left or self._elapsed() < self._left[-1]):
             return
         self._synchronise()
         elapsed, start = self._elapsed(), time.perf_counter()

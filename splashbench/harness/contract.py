@@ -101,15 +101,21 @@ class Run:
         """Write into record.json what the method found out by itself and went by, in a few words."""
         self.notes[name] = text
 
-    def checkpoint(self, state: Callable[[], Fitted]) -> None:
+    @property
+    def watched(self) -> bool:
+        """Whether states of the fit are taken on its way, so that a first one is worth seconds of its own."""
+        return self._checkpoints is not None
+
+    def checkpoint(self, state: Callable[[], Fitted], milestone: bool = False) -> None:
         """Offer the state of the fit, as if it ended here: at every step, or as often as there is something to show.
 
         Args:
             state: makes a model that can be saved. It is called at a few offers only, outside the clock, and must not
                 change the fit: with or without checkpoints the same model has to come out.
+            milestone: take it in any case, for there will be no other for a while.
         """
         if self._checkpoints is not None:
-            self._checkpoints.offer(state)
+            self._checkpoints.offer(state, milestone)
 
     def side_by_side(
         self, first: Callable[[Run], T], second: Callable[[Run], U], span: tuple[float, float] = (0.0, 1.0)
@@ -195,6 +201,8 @@ class MethodConfig(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             first = error.errors()[0]
+            if not first["loc"]:  # of several settings together
+                raise SplashbenchError(str(first["ctx"]["error"])) from None
             key = ".".join(str(part) for part in first["loc"])
             fields = ", ".join(sorted(cls.model_fields)) or "none"
             raise SplashbenchError(f"setting {key}: {first['msg']}; this method's settings: {fields}") from None

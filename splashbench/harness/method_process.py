@@ -6,6 +6,7 @@ Fitting and rendering are two processes, so that a model which renders only in t
 
 from __future__ import annotations
 
+import importlib
 import statistics
 import sys
 import time
@@ -62,11 +63,19 @@ def _one_line(error: BaseException) -> str:
     return text if isinstance(error, SplashbenchError) else f"{type(error).__name__}: {text}"
 
 
+def _load_compiler() -> None:
+    """PyTorch loads its compiler, which takes seconds, when a first optimiser is made: no more a part of a fit than
+    loading PyTorch itself, which methods have done by now."""
+    if "torch" in sys.modules:
+        importlib.import_module("torch._dynamo")
+
+
 def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
     config = method.Config.preset(request.preset, request.overrides)
     support = method.supports(scene)
     if not support.ok:
         raise Failure(Status.UNSUPPORTED, support.reason or "the method gave no reason")
+    _load_compiler()
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         run = Run(
             seed=request.seed,

@@ -146,10 +146,13 @@ def _meeting_point(silhouettes: Silhouettes) -> np.ndarray:
     return np.linalg.lstsq(normal, right, rcond=None)[0]
 
 
-def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerOcclusion | None = None) -> Bounds:
+def sequence_bounds(
+    scene: MaskedScene | Silhouettes, container: ContainerOcclusion | None = None, tight: bool = True
+) -> Bounds:
     """Box around the union of the hulls of all frames, scene units, without padding.
 
-    container: where given, the box leaves out what it does not allow, and holds what it may hide.
+    container: where given, the box leaves out what it does not allow, and holds what it may hide. tight: look at every
+    frame; else the box is that of the hull of all masks together, which is larger and found in no time.
 
     Raises SplashbenchError when the masks of the views have no common hull (wrong cameras, or masks of another scene).
     """
@@ -173,6 +176,8 @@ def sequence_bounds(scene: MaskedScene | Silhouettes, container: ContainerOcclus
                 f"check the camera poses, and that masks and cameras belong together{where}"
             )
         bounds = common
+    if not tight:
+        return bounds
     grid = Grid.over(bounds.padded(0.02), REFINED_CELLS)
     carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
     nearest = np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)

@@ -94,6 +94,14 @@ def test_a_state_is_taken_at_the_first_offer_after_each_mark(tmp_path: Path) -> 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00", "01", "02"]
 
 
+def test_a_milestone_is_taken_at_once(tmp_path: Path) -> None:
+    elapsed = Elapsed()
+    taken = Checkpoints(tmp_path, [5.0, 10.0], elapsed, lambda: None)
+    for elapsed.seconds in (1.0, 2.0, 3.0, 5.0, 6.0, 7.0):
+        taken.offer(lambda: Grey(0.5), milestone=elapsed.seconds in (2.0, 6.0))
+    assert taken.seconds == [2.0, 5.0, 6.0]
+
+
 def test_the_marks_are_those_of_the_charts() -> None:
     assert MARKS[:5] == (5, 10, 20, 40, 80)
 

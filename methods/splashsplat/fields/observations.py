@@ -24,7 +24,7 @@ from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.scene import TrainingScene
 
-from .container import known_container
+from .container import KnownContainer, known_container
 from .gravity_cues import GravityCues, gravity_cues
 from .occlusion import LiquidOcclusion
 from .rim import rim_of
@@ -50,6 +50,7 @@ class FieldSettings:
     camera_times: bool
     pool: bool
     ballistic: bool
+    tight_bounds: bool = True
 
     def key(self) -> dict[str, Any]:
         """What a stored phi_t was computed with; it is on the hull grid, whatever the transport grid."""
@@ -124,8 +125,13 @@ def pack_signed_distance(phi: np.ndarray) -> np.ndarray:
     return SignedDistance.of(phi[None], np.zeros(3), 1.0).phi[0]
 
 
-def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Report) -> Observations:
-    """Look at the masks of all frames of `scene`. Raises SplashbenchError when they have no common hull."""
+def observe(
+    scene: TrainingScene, settings: FieldSettings, run: Run, report: Report, known: KnownContainer | None = None
+) -> Observations:
+    """Look at the masks of all frames of `scene`. known: its container, where it was looked for already.
+
+    Raises SplashbenchError when the masks have no common hull.
+    """
     report(0.0, "reading masks")
     with run.stage("signed distance"):
         observed = reduced(scene, settings.hull_cells) if settings.signed_distance == "silhouette" else scene
@@ -134,7 +140,7 @@ def observe(scene: TrainingScene, settings: FieldSettings, run: Run, report: Rep
             interpolate_times=None if settings.camera_times else False,
             replace_empty=settings.replace_empty_masks,
         )
-        known = known_container(scene, settings.container, settings.container_masks)
+        known = known or known_container(scene, settings.container, settings.container_masks)
         container, gravity = known.occlusion, known.gravity
     run.note("container", str(known))
     if gravity is not None:
@@ -194,7 +200,7 @@ def _bounds(
                 bounds = trusted_bounds(silhouettes, container)
         else:
             with run.stage("signed distance"):
-                bounds = sequence_bounds(silhouettes, container)
+                bounds = sequence_bounds(silhouettes, container, settings.tight_bounds)
         return silhouettes.failed_masks, bounds.padded(PADDING)
 
     def save(result: tuple[np.ndarray, Bounds], directory: Path) -> None:

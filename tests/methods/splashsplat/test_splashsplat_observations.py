@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splashbench.harness.contract import Run
+from splashbench.observe import Bounds, Silhouettes, sequence_bounds
 from splashbench.scene import Scene
 from splashbench_methods.splashsplat.fields import observations
 from splashbench_methods.splashsplat.fields.observations import Observations, Report, observe
@@ -85,7 +86,12 @@ def test_another_run_takes_over_what_its_settings_leave_as_it_was(
 def test_masks_that_failed_stay_distrusted(balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distrusted = np.zeros((balls.n_frames, len(balls.train)), dtype=bool)
     distrusted[[1, 4], [0, 2]] = True
-    monkeypatch.setattr(observations, "distrust_failed_masks", lambda masks, container: masks.distrust(distrusted))
+
+    def look(masks: Silhouettes, container: object) -> Bounds:
+        masks.distrust(distrusted)
+        return sequence_bounds(masks)
+
+    monkeypatch.setattr(observations, "trusted_bounds", look)
     first, _ = _observed(balls, Run(cache=tmp_path))
     monkeypatch.undo()
     run = Run(cache=tmp_path)

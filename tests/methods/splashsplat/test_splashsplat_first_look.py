@@ -1,0 +1,115 @@
+"""What a fit begins with: carriers in the colours of the photographs, and a draft where states of the fit are taken."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.harness.checkpoints import Checkpoints
+from splashbench.harness.contract import Run
+from splashbench.scene import Scene
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
+from splashbench_methods.splashsplat.appearance.first_look import Look, photographed, take_on
+from splashbench_methods.splashsplat.appearance.fitting import Appearance
+from splashbench_methods.splashsplat.appearance.targets import TrainingTarget, collect_targets
+from splashbench_methods.splashsplat.carriers.subframe import CarrierState, Track
+from splashbench_methods.splashsplat.reconstruction import trace_liquid
+
+TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 20}
+
+
+@pytest.fixture(scope="module")
+def taught(balls: Scene) -> tuple[Track, list[TrainingTarget]]:
+    training = balls.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+    traced = trace_liquid(training, SplashSplatConfig.preset("quick", TINY), Run(seed=1))
+    track = Track(traced.observations.grid, traced.carriers, traced.motion, traced.packed)
+    return track, collect_targets(training, grey, track, "window")
+
+
+def test_carriers_have_the_colour_of_the_photographs_that_see_them(
+    balls: Scene, taught: tuple[Track, list[TrainingTarget]]
+) -> None:
+    track, targets = taught
+    look = photographed(track, targets)
+    colors = look.colors
+    assert colors.dtype == np.float32
+    assert colors.shape == (track.carriers.count, 3)
+    # At test views, the nearest carrier of a pixel has about the pixel's colour; the mean of all is much farther off.
+    errors, spread = [], []
+    for name in balls.test:
+        camera = balls.cameras[name]
+        for t in range(balls.n_frames):
+            pixels, depth = camera.project(track.state(t).positions.numpy())
+            row, column = np.clip(pixels.astype(int).T[::-1], 0, [[camera.height - 1], [camera.width - 1]])
+            order = np.argsort(depth)
+            _, first = np.unique(row[order] * camera.width + column[order], return_index=True)
+            front = order[first]
+            front = front[balls.mask(name, t)[row[front], column[front]]]
+            truth = balls.image(name, t)[row[front], column[front]] / 255
+            errors.append(np.abs(colors[track.ids(t).numpy()[front]] - truth).mean(axis=1))
+            spread.append(np.abs(truth - colors.mean(axis=0)).mean(axis=1))
+    assert np.median(np.concatenate(errors)) < 0.4 * np.median(np.concatenate(spread))
+
+
+def test_without_a_photograph_carriers_are_grey(taught: tuple[Track, list[TrainingTarget]]) -> None:
+    look = photographed(taught[0], [])
+    np.testing.assert_array_equal(look.colors, 0.5)
+    np.testing.assert_array_equal(look.spread, 0)
+
+
+@pytest.mark.parametrize("children", [1, 2])
+@torch.no_grad()
+def test_the_decoder_hands_colours_on_from_every_side(children: int) -> None:
+    torch.manual_seed(0)
+    features = 0.1 * torch.randn(50, 16)
+    decoder = Decoder(DecoderSettings(feature_size=16, color_width=32, children=children))
+    colors = np.random.default_rng(0).uniform(0.05, 0.95, (50, 3)).astype(np.float32)
+    spread = np.linspace(0, 0.2, 50, dtype=np.float32)
+    take_on(Look(colors, spread), features, decoder)
+    state = CarrierState(torch.randn(50, 3), torch.eye(3).expand(50, 3, 3), torch.zeros(50))
+    for eye in torch.eye(3):
+        shown, _ = decoder.decode(features, torch.zeros(50, 3), None, state, 5 * eye)
+        error = (shown.colors - torch.from_numpy(colors)[:, None]).abs()
+        assert float(error.mean()) < 0.03
+        assert float(error.max()) < 0.15
+    # Opacities follow the doubt, and none of the colours.
+    opacity = decoder.mean_opacity(features)
+    assert np.corrcoef(np.log(opacity.numpy()), spread)[0, 1] < -0.95
+    assert float(opacity[-1]) < 0.02 < 0.2 < float(opacity[0])
+    others = features.clone()
+    others[:, :3] = -others[:, :3]
+    torch.testing.assert_close(decoder.mean_opacity(others), opacity)
+
+
+def test_a_draft_comes_first_where_states_are_taken_and_the_fit_is_the_same(balls: Scene, tmp_path: Path) -> None:
+    scene, config = balls.training(), SplashSplatConfig.preset("quick", TINY | {"draft_cells": 32})
+
+    def fit(run: Run) -> Appearance:
+        return SplashSplat().fit(scene, config, run).liquid.appearance
+
+    watched = Run(seed=1)
+    watched._checkpoints = Checkpoints(tmp_path, [1e9], lambda: 7.0, lambda: None)
+    with_draft, without = fit(watched), fit(Run(seed=1))
+    assert torch.equal(with_draft.features, without.features)
+    assert watched._checkpoints.seconds == [7.0]
+    assert watched.stages["draft"] > 0
+    draft = SplashSplat().load(tmp_path / "00", scene)
+    assert len(draft.background.model) == 0
+    # Already it shows balls where the balls are.
+    overlaps = []
+    for name in balls.test:
+        for t in range(balls.n_frames):
+            found, mask = draft.render(balls.cameras[name], balls.times[t]).alpha > 0.5, balls.mask(name, t)
+            overlaps.append((found & mask).sum() / (found | mask).sum())
+    assert np.mean(overlaps) > 0.5
+
+
+def test_no_draft_where_none_is_asked_for(balls: Scene, tmp_path: Path) -> None:
+    run = Run(seed=1)
+    run._checkpoints = Checkpoints(tmp_path, [1e9], lambda: 7.0, lambda: None)
+    SplashSplat().fit(balls.training(), SplashSplatConfig.preset("quick", TINY | {"draft_cells": 0}), run)
+    assert run._checkpoints.seconds == []
+    assert "draft" not in run.stages
