@@ -82,7 +82,7 @@ def fit_liquid(
 
     backgrounds: float32 [H, W, 3] of every training view, in [0, 1]; or [3] where `frozen` has the background's
     Gaussians of every view, to be drawn together with the liquid's. span: the part of `run`'s progress this takes up.
-    offer: is given, after every iteration of the appearance, what makes the reconstruction as if the fit ended there.
+    offer: is given, after iterations of the appearance, what makes the reconstruction as if the fit ended there.
     """
     config, observations, carriers = traced.config, traced.observations, traced.carriers
     motion, packed = traced.motion, traced.packed

@@ -206,8 +206,8 @@ def fit_appearance(
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
 
-    offer: is given, after every iteration, what makes the appearance as it is, and the carriers still fitted: bool
-    [count].
+    offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, and the
+    carriers still fitted: bool [count].
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -331,7 +331,8 @@ def fit_appearance(
         scales.step(active.ids, by_scale, factor)
         iteration += 1
         progress(schedule.done(iteration))
-        if offer is not None:
+        # Until every photograph was seen once, there is less to see than before the fit, in a draft.
+        if offer is not None and iteration >= len(targets):
             offer(state)
     reader.close()
     appearance.features = features.all()
