@@ -289,6 +289,31 @@ def told_nothing() -> Figure:
     return figure
 
 
+def quality_over_time() -> Figure:
+    rows = [row for row in read(HERE / "data" / "quality_over_time.csv") if row["seconds"]]
+    figure = Figure(figsize=(9.2, 2.8), layout="constrained")
+    places = figure.subplots(1, 3)
+    marks = (("spacetime_gaussians", "s", GREY), ("scaffold_4d", "D", BLUE), ("splashsplat", "o", VERMILION))
+    for place, (metric, title) in zip(
+        places, (("psnr", "PSNR of the liquid, dB"), ("lpips", "LPIPS (less is better)"), ("miou", "mIoU"))
+    ):
+        for name, marker, color in marks:
+            points = [
+                (float(row["seconds"]), float(row["value"]))
+                for row in rows
+                if (row["row"], row["metric"]) == (name, metric)
+            ]
+            place.step(*zip(*points), where="post", color=color, lw=1.4)
+            place.plot(*zip(*points), marker, mec=color, mfc="white", ms=4, label=name)
+        place.set_xscale("log")
+        place.set_xticks([5, 10, 20, 40, 80, 160, 300], ["5", "10", "20", "40", "80", "160", "300"], minor=False)
+        place.set_xticks([], minor=True)
+        place.set_xlabel("seconds of the fit")
+        place.set_title(title)
+    legend(places[-1])
+    return figure
+
+
 def whole_fit() -> Figure:
     rows = read(HERE / "data" / "by_scene.csv")
     phases = {row["metric"]: float(row["value"]) for row in rows if row["study"] == "whole_fit"}
@@ -318,6 +343,7 @@ CHARTS: dict[str, Callable[[], Figure]] = {
     "carriers": carriers,
     "transport": transport,
     "told_nothing": told_nothing,
+    "quality_over_time": quality_over_time,
     "whole_fit": whole_fit,
 }
 

@@ -145,6 +145,22 @@ def test_told_nothing_elsewhere_is_what_was_measured(number: int, kind: str) -> 
                 assert float(part.strip(" *†")) == pytest.approx(mean, abs=0.51 * 10**-digits)
 
 
+def test_quality_over_time_is_that_of_the_committed_results() -> None:
+    with (RESULTS / "data" / "quality_over_time.csv").open(encoding="utf-8", newline="") as file:
+        _, *lines = [tuple(line) for line in csv.reader(file)]
+    made = runpy.run_path(str(ROOT / "docs" / "tools" / "quality_over_time.py"))["table"]()
+    assert lines == made
+    measured = {(row, metric, seconds): float(value) for row, metric, seconds, value in lines}
+    header, _, *table = first_table("speed.md")
+    names = header[1:]
+    assert [line[0] for line in table] == ["10 s", "30 s", "60 s", "120 s", "300 s"]
+    for seconds, *cells in table:
+        for name, cell in zip(names, cells, strict=True):
+            for part, metric, digits in zip(cell.split("/"), ("psnr", "lpips", "miou"), (2, 4, 3), strict=True):
+                value = measured[name, metric, seconds.removesuffix(" s")]
+                assert float(part.strip(" *†")) == pytest.approx(value, abs=0.51 * 10**-digits)
+
+
 def test_told_all_is_what_was_measured() -> None:
     measured, table = told_nothing(), tables("told_nothing.md")[4]
     scenes = table[0][1:-1]

@@ -1,0 +1,82 @@
+"""Writes docs/results/data/quality_over_time.csv from the committed results of leaderboards/told_nothing.
+
+    python docs/tools/quality_over_time.py
+
+What each method has to show after so many seconds of its fit, as the leaderboard's page counts it: the mean over scenes
+of means over seeds. `reached` is the share of a rival's fit time in which splashsplat has the rival's final value, the
+median over rivals and scenes.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from statistics import mean, median
+
+from splashbench.files import atomic_path
+from splashbench.report.anytime import before, trajectories
+from splashbench.report.groups import Group, groups
+from splashbench.report.results import load_results
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "leaderboards" / "told_nothing" / "results"
+TABLE = ROOT / "docs" / "results" / "data" / "quality_over_time.csv"
+#: seconds; those of the page's table are among them
+SECONDS = (5, 7, 10, 14, 20, 30, 40, 60, 80, 120, 160, 220, 300)
+METRICS = ("psnr", "lpips", "miou")
+METHODS = ("splashsplat", "scaffold_4d", "spacetime_gaussians")
+
+
+def rows(group: Group) -> list[tuple[str, str, str, str]]:
+    """method, metric, seconds and value, as text."""
+    found = []
+    entries = {entry.results[0].method: entry for entry in group.entries}
+    for method in METHODS:
+        for metric in METRICS:
+            nothing = before(group, metric)
+            runs = trajectories(group, entries[method], metric)
+            for seconds in SECONDS:
+                scenes: dict[str, list[float]] = {}
+                for (scene, _), run in runs.items():
+                    scenes.setdefault(scene, []).append(run.at(seconds, nothing[scene]))
+                found.append((method, metric, str(seconds), f"{mean(map(mean, scenes.values())):.4f}"))
+    found.append(("splashsplat", "reached", "", f"{reached(group):.2f}"))
+    return found
+
+
+def reached(group: Group) -> float:
+    """See above; of PSNR. A run that never has the value counts as endless."""
+    entries = {entry.results[0].method: entry for entry in group.entries}
+    ours = trajectories(group, entries["splashsplat"], "psnr")
+    shares = []
+    for rival in METHODS[1:]:
+        theirs = trajectories(group, entries[rival], "psnr")
+        for scene in {scene for scene, _ in theirs}:
+            of_scene = [run for (where, _), run in theirs.items() if where == scene]
+            goal, spent = mean(run.values[-1] for run in of_scene), mean(run.seconds[-1] for run in of_scene)
+            times = [
+                min((s for s, value in zip(run.seconds, run.values) if value >= goal), default=float("inf"))
+                for (where, _), run in ours.items()
+                if where == scene
+            ]
+            shares.append(mean(times) / spent)
+    return median(shares)
+
+
+def table() -> list[tuple[str, str, str, str]]:
+    """The rows of the one group of the committed results."""
+    (group,) = groups(load_results(RESULTS))
+    return rows(group)
+
+
+def main() -> int:
+    with atomic_path(TABLE) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["row", "metric", "seconds", "value"])
+        writer.writerows(table())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
