@@ -119,8 +119,7 @@ def fit_background(
         if plate.seen.any():
             plates.append(plate)
     if not plates:
-        when = "in frame 0" if settings.frames == "first" else "throughout"
-        raise SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; fix the masks")
+        raise _covered(scene, "in frame 0" if settings.frames == "first" else "throughout")
     far_color = np.median(np.concatenate([plate.image[plate.seen] for plate in plates]), axis=0) / 255
     progress(0.05, "depths of the background")
     seed = _seed(points, [plate.without_beside() for plate in plates], settings, run.seed)
@@ -137,16 +136,25 @@ def fit_background(
         return Background(supervised_anchors(model, plates), far_color)
 
 
-def flat_background(scene: TrainingScene) -> tuple[Background, dict[str, NDArray[np.float32]]]:
+def _covered(scene: TrainingScene, when: str) -> SplashbenchError:
+    return SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; fix the masks")
+
+
+def flat_background(
+    scene: TrainingScene, n_frames: int = MAX_FRAMES
+) -> tuple[Background, dict[str, NDArray[np.float32]]]:
     """For who cannot wait: a background of one colour, and what lies behind the liquid in each training view.
 
-    That is frame 0 where it is free of liquid, and elsewhere the colour, the median of all that is: float32 [H, W, 3].
+    That is the median of `n_frames` frames where they are free of liquid, and where none is the colour, the median of
+    all that is: float32 [H, W, 3]. Raises SplashbenchError where masks cover everything in more than one frame.
     """
     plates = {}
     for name in scene.train:
         camera = scene.cameras[name]
-        plates[name] = make_clean_plate(scene, name, max(camera.width, camera.height), n_frames=1)
+        plates[name] = make_clean_plate(scene, name, max(camera.width, camera.height), n_frames)
     seen = np.concatenate([plate.image[plate.seen] for plate in plates.values()])
+    if not len(seen) and n_frames > 1:
+        raise _covered(scene, "throughout")
     color = (np.median(seen, axis=0) / 255).astype(np.float32) if len(seen) else np.full(3, 0.5, np.float32)
     behind = {name: np.where(plate.seen[..., None], plate.floats(), color) for name, plate in plates.items()}
     return Background(AnchorModel(0, StaticAnchorSpec(1)), color), behind

@@ -28,7 +28,7 @@ def make_draft(
     """The liquid, a background of one colour, and what hides the liquid from cameras. config: that of the fit."""
     from ..scaffold_gs import flat_background
 
-    background, behind = flat_background(scene)
+    background, behind = flat_background(scene, n_frames=1)
     # A run of its own: nothing in it counts as a stage, a note or a part that others may take over.
     run, coarse = Run(seed=seed), config.draft()
     liquid, occlusion = fit_liquid(scene, behind, trace_liquid(scene, coarse, run, known), run)

@@ -129,6 +129,11 @@ class FittedSplashSplat(Fitted):
             self.occlusion.save(static)
 
 
+def _seen_by_all(background: Background, scene: TrainingScene) -> dict[str, np.ndarray]:
+    """What each training view of `scene` shows of `background`, float32 [H, W, 3]."""
+    return {name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()}
+
+
 class SplashSplat(Method):
     """Carriers moved by a fitted velocity field, corrected and refilled by the hull, decoded into Gaussians."""
 
@@ -145,8 +150,11 @@ class SplashSplat(Method):
         return Support(True)
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
-        """Background beside observation fields and carriers, which do not need it; then the appearance."""
-        from ..scaffold_gs import shared_background
+        """Observation fields and carriers, then the appearance, whose first iterations need no background yet.
+
+        Where there are cores, the background is fitted beside the carriers, and else once it is needed.
+        """
+        from ..scaffold_gs import flat_background, shared_background
 
         if config.variant == "flip":
             metric_gravity(scene)  # an error now rather than after the background
@@ -162,27 +170,44 @@ class SplashSplat(Method):
                 known = known_container(scene, config.container, config.container_masks)
                 draft = FittedSplashSplat(*make_draft(scene, config, run.seed, known))
             run.checkpoint(lambda: draft, milestone=True)
-        background, traced = run.side_by_side(
+        deferred = config.plates_share > 0 and config.composition != "together"
+        behind: dict[str, np.ndarray]
+        frozen: dict[str, Frozen] | None = None
+        settled: Callable[[], dict[str, np.ndarray]] | None = None
+        if deferred:
+            with run.stage("background"):
+                background, behind = flat_background(scene)
+        late, traced = run.ahead(
             fit_background, lambda part: trace_liquid(scene, config, part, known), span=(0, _BEFORE)
         )
-        frozen: dict[str, Frozen] | None = None
         if config.composition == "together":
+            background = late()
             behind = dict.fromkeys(scene.train, background.far_color)
             frozen = {
                 name: freeze(*background.gaussians(scene.cameras[name]), scene.cameras[name]) for name in scene.train
             }
+        elif not deferred:
+            background = late()
+            behind = _seen_by_all(background, scene)
         else:
-            behind = {
-                name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()
-            }
 
-        def offer(state: Callable[[], Reconstruction]) -> None:
-            run.checkpoint(lambda: fitted(*state()))
+            def settled() -> dict[str, np.ndarray]:
+                nonlocal background
+                background = late()
+                return _seen_by_all(background, scene)
 
-        def fitted(liquid: Liquid, occlusion: LiquidOcclusion | None) -> FittedSplashSplat:
-            return FittedSplashSplat(liquid, background, occlusion)
+        def offer(state: Callable[[], Reconstruction], milestone: bool) -> None:
+            run.checkpoint(lambda: FittedSplashSplat(*with_background(*state())), milestone)
 
-        return fitted(*fit_liquid(scene, behind, traced, run, span=(_BEFORE, 1), frozen=frozen, offer=offer))
+        def with_background(
+            liquid: Liquid, occlusion: LiquidOcclusion | None
+        ) -> tuple[Liquid, Background, LiquidOcclusion | None]:
+            return liquid, background, occlusion
+
+        found = fit_liquid(scene, behind, traced, run, (_BEFORE, 1), frozen, offer, settled)
+        if settled is not None:
+            background = late()  # a fit without any photograph asked for none
+        return FittedSplashSplat(*with_background(*found))
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""

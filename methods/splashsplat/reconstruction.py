@@ -18,10 +18,10 @@ from splashbench.observe.container import solid_distance
 from splashbench.render import Frozen
 from splashbench.scene.scene import TrainingScene
 
-from .appearance.coarse import with_half_size
+from .appearance.coarse import set_half_backgrounds, with_half_size
 from .appearance.first_look import photographed, take_on
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
-from .appearance.targets import collect_targets
+from .appearance.targets import collect_targets, set_backgrounds
 from .carriers.coverage import uncovered_by_any
 from .carriers.population import Carriers
 from .carriers.subframe import Track
@@ -76,13 +76,16 @@ def fit_liquid(
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
     frozen: Mapping[str, Frozen] | None = None,
-    offer: Callable[[Callable[[], Reconstruction]], None] | None = None,
+    offer: Callable[[Callable[[], Reconstruction], bool], None] | None = None,
+    settled: Callable[[], dict[str, np.ndarray]] | None = None,
 ) -> Reconstruction:
     """Fit the appearance of the liquid of `scene`; returns it, and what hides it from cameras.
 
     backgrounds: float32 [H, W, 3] of every training view, in [0, 1]; or [3] where `frozen` has the background's
     Gaussians of every view, to be drawn together with the liquid's. span: the part of `run`'s progress this takes up.
-    offer: is given, after iterations of the appearance, what makes the reconstruction as if the fit ended there.
+    offer: is given, after iterations of the appearance, what makes the reconstruction as if the fit ended there, and
+    whether there will be no other for a while. settled: where given, `backgrounds` are for the first iterations
+    (`plates_share`), and this gives those for the others.
     """
     config, observations, carriers = traced.config, traced.observations, traced.carriers
     motion, packed = traced.motion, traced.packed
@@ -108,9 +111,9 @@ def fit_liquid(
         )
         return liquid, occlusion
 
-    def offer_state(state: Callable[[], tuple[Appearance, np.ndarray]]) -> None:
+    def offer_state(state: Callable[[], tuple[Appearance, np.ndarray]], milestone: bool) -> None:
         if offer is not None:
-            offer(lambda: reconstruction(*state()))
+            offer(lambda: reconstruction(*state()), milestone)
 
     with run.stage("appearance"), one_torch_thread():
         track = Track(observations.grid, carriers, motion, packed)
@@ -125,6 +128,7 @@ def fit_liquid(
             run.seed,
             lambda done: run.progress(span[0] + (span[1] - span[0]) * done, "appearance"),
             offer_state,
+            settled,
         )
         return reconstruction(appearance, left)
 
@@ -217,7 +221,8 @@ def _fit_appearance(
     config: SplashSplatConfig,
     seed: int,
     progress: Callable[[float], None],
-    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]]], None],
+    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None],
+    settled: Callable[[], dict[str, np.ndarray]] | None,
 ) -> tuple[Appearance, np.ndarray]:
     """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; and which of them
     were fitted to the end, bool [count]."""
@@ -250,7 +255,14 @@ def _fit_appearance(
     if config.first_look:
         take_on(photographed(track, targets), appearance.features, appearance.decoder)
     color_cell = observations.hull_grid.voxel / voxel
-    fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer)
+
+    def settle() -> None:
+        if settled is not None:
+            behind = settled()
+            set_backgrounds(targets, behind)
+            set_half_backgrounds(targets, behind)
+
+    fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle)
     return appearance, fit.left
 
 

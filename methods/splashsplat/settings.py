@@ -34,16 +34,21 @@ if TYPE_CHECKING:
 _DRAFT_ITERATIONS = 300
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "12"
+VERSION = "13"
 
 
 class SplashSplatConfig(MethodConfig):
     """Settings of SplashSplat. Lengths are in transport voxels; *_cells counts cells along the longest side."""
 
     # Observation fields
-    hull_cells: int = Field(224, ge=16, le=512)
-    transport_cells: int = Field(112, ge=16, le=256)
-    control_cells: int = Field(28, ge=4, le=128)
+    hull_cells: int = Field(300, ge=16, le=512)
+    #: edge of a hull voxel in pixels of the photographs, at the least: grids have fewer cells than `hull_cells`,
+    #: `transport_cells` and `control_cells` where that many do; 0 for as many always
+    voxel_pixels: float = Field(0.6, ge=0, le=16)
+    #: the same in a transparent container, whose liquid is seen through its sides
+    clear_voxel_pixels: float = Field(0.8, ge=0, le=16)
+    transport_cells: int = Field(150, ge=16, le=256)
+    control_cells: int = Field(38, ge=4, le=128)
     #: control cells are "cubes", `control_cells` of them along the longest side, or along every one of the "sides" of
     #: the box, as the paper's 24^3
     control_grid: Literal["cubes", "sides"] = "cubes"
@@ -71,7 +76,9 @@ class SplashSplatConfig(MethodConfig):
     ballistic: bool = True
     #: no motion where the level set's leads farther away from the observations than none
     gate_motion: bool = True
-    velocity_steps: int = Field(35, ge=0)
+    velocity_steps: int = Field(15, ge=0)
+    #: the fit of a step starts from the motion of the one before, not from none
+    velocity_carry_on: bool = True
     velocity_step_size: PositiveFloat = 0.45
     velocity_band: PositiveFloat = 4.0
     velocity_smoothing: float = Field(0.6, ge=0)
@@ -121,7 +128,7 @@ class SplashSplatConfig(MethodConfig):
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
-    iterations: int = Field(6000, ge=0)
+    iterations: int = Field(4000, ge=0)
     learning_rate_features: PositiveFloat = 0.06
     learning_rate_cells: PositiveFloat = 0.02
     learning_rate_heads: PositiveFloat = 0.015
@@ -159,6 +166,9 @@ class SplashSplatConfig(MethodConfig):
     coarse_share: float = Field(0.8, ge=0, le=1)
     #: pixels along the longest side beyond which photographs are large enough for that
     coarse_side: PositiveInt = 1500
+    #: share of the iterations, the first ones, that have the footage's clean plates behind the liquid: the background
+    #: is fitted afterwards; 0 fits it first. Not where it is drawn "together" with the liquid
+    plates_share: float = Field(0.2, ge=0, le=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "brief", "quick"] = "brief"
     #: hull cells of a draft that is made first where states of the fit are taken (`run --checkpoints`); 0 for none
@@ -178,6 +188,8 @@ class SplashSplatConfig(MethodConfig):
             "hull_cells": 176,
             "transport_cells": 96,
             "control_cells": 24,
+            "voxel_pixels": 0.0,
+            "clear_voxel_pixels": 0.0,
             "control_grid": "sides",
             "signed_distance": "carve",
             "container": False,
@@ -216,12 +228,15 @@ class SplashSplatConfig(MethodConfig):
             "still_cell": 0.0,
             "anneal": False,
             "silhouette_norm": "image",
+            "velocity_steps": 35,
+            "velocity_carry_on": False,
             "composition": "together",
             "between_frames": "forward",
             "validation_share": 0.0,
             "prune_opacity": 0.0,
             "idle_share": 0.0,
             "coarse_share": 0.0,
+            "plates_share": 0.0,
             "first_look": False,
             "background_preset": "paper",
             "draft_cells": 0,
@@ -235,6 +250,7 @@ class SplashSplatConfig(MethodConfig):
             "max_per_cell": 4,
             "shell_outside": 0.125,
             "iterations": 800,
+            "plates_share": 0.0,
             "validation_share": 0.04,
             "ssim_every": 2,
             "background_preset": "quick",
@@ -266,6 +282,8 @@ class SplashSplatConfig(MethodConfig):
         return FieldSettings(
             hull_cells=self.hull_cells,
             transport_cells=self.transport_cells,
+            voxel_pixels=self.voxel_pixels,
+            clear_voxel_pixels=self.clear_voxel_pixels,
             signed_distance=self.signed_distance,
             container=self.container,
             container_masks=self.container_masks,
@@ -296,6 +314,7 @@ class SplashSplatConfig(MethodConfig):
             self.variant != "per_frame",
             velocity,
             self.control_cells if self.control_grid == "sides" else None,
+            self.velocity_carry_on,
         )
 
     def in_transparent_container(self) -> SplashSplatConfig:
@@ -321,6 +340,7 @@ class SplashSplatConfig(MethodConfig):
                 "iterations": _DRAFT_ITERATIONS,
                 "validation_share": 0.0,
                 "idle_share": 0.0,
+                "plates_share": 0.0,
             }
         )
 
@@ -372,6 +392,7 @@ class SplashSplatConfig(MethodConfig):
             prune_opacity=self.prune_opacity,
             idle_share=self.idle_share,
             coarse_share=self.coarse_share,
+            plates_share=self.plates_share,
             weights=LossWeights(
                 foreground=self.foreground_weight,
                 gradient=self.gradient_weight,

@@ -53,7 +53,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--checkpoints",
         action="store_true",
-        help="also keep the views of the fit on its way, after about 5, 10, 20, 40 ... seconds of it",
+        help="also keep the views of the fit on its way, after about 5, 7, 10, 14, 20 ... seconds of it",
     )
     add_run_options(parser)
 

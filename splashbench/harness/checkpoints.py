@@ -17,8 +17,9 @@ from typing import Protocol
 
 import numpy as np
 
-#: Seconds of the fit at which a state is asked for: 5, 10, 20, 40 and so on, for a month.
-MARKS = tuple(5.0 * 2**k for k in range(20))
+#: Seconds of the fit at which a state is asked for: two for each doubling, for a month. Each is a little early, so that
+#: what comes at the first offer after it counts within 10, 30, 60, 120 and 300 seconds.
+MARKS = tuple(4.8 * 2 ** (k / 2) for k in range(40))
 
 
 class Savable(Protocol):

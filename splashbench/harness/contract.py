@@ -72,27 +72,32 @@ class Run:
     stages: dict[str, float] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
     _overhead_seconds: float = 0.0
+    _inner_seconds: float = 0.0
+    _told: float = 0.0
     _digests: dict[Path, str] = field(default_factory=dict)
     _report: Callable[[float, str], None] | None = None
     _checkpoints: Checkpoints | None = None
 
     def progress(self, fraction: float, message: str = "") -> None:
         """Tell the user how far the fit is: `fraction` in [0, 1], and what is being done."""
+        self._told = float(fraction)
         if self._report is not None:
-            self._report(float(fraction), message)
+            self._report(self._told, message)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Count the wall time of what is within as the stage `name`, for record.json; stages may come back.
 
-        What checkpoints take is left out.
+        What checkpoints and stages within it take is left out.
         """
         start, before = time.perf_counter(), self._checkpoint_seconds()
+        around, self._inner_seconds = self._inner_seconds, 0.0
         try:
             yield
         finally:
             seconds = time.perf_counter() - start - (self._checkpoint_seconds() - before)
-            self.stages[name] = self.stages.get(name, 0.0) + seconds
+            self.stages[name] = self.stages.get(name, 0.0) + seconds - self._inner_seconds
+            self._inner_seconds = around + seconds
 
     def _checkpoint_seconds(self) -> float:
         return 0.0 if self._checkpoints is None else self._checkpoints.spent
@@ -133,6 +138,17 @@ class Run:
         from splashbench.harness.side_by_side import side_by_side
 
         return side_by_side(self, first, second, span)
+
+    def ahead(
+        self, first: Callable[[Run], T], second: Callable[[Run], U], span: tuple[float, float] = (0.0, 1.0)
+    ) -> tuple[Callable[[], T], U]:
+        """As `side_by_side`, for a `first` that is needed later than `second`: what returns it, and what `second` did.
+
+        Where there is one core, `first` is made when it is asked for, once. Both have to give the same at either time.
+        """
+        from splashbench.harness.side_by_side import ahead
+
+        return ahead(self, first, second, span)
 
     def reuse(
         self,

@@ -32,8 +32,9 @@ class _Part:
         self.fraction, self.message, self.seconds = 0.0, "", 0.0
         self._report, self._failed = report, failed
         self.run = replace(
-            run, reused={}, stages={}, notes={}, _overhead_seconds=0.0, _report=self.hear, _checkpoints=None
-        )
+            run, reused={}, stages={}, notes={}, _overhead_seconds=0.0, _inner_seconds=0.0, _report=self.hear,
+            _checkpoints=None,
+        )  # fmt: skip
 
     def hear(self, fraction: float, message: str) -> None:
         if self._failed.is_set():
@@ -82,6 +83,36 @@ def side_by_side(
     # `fit_seconds` takes the wall time and adds what was reused: what is over `took` is to go.
     run._overhead_seconds += wall + sum(sum(part.run.reused.values()) for part in parts) - took
     return results
+
+
+def ahead(
+    run: Run, first: Callable[[Run], First], second: Callable[[Run], Second], span: tuple[float, float]
+) -> tuple[Callable[[], First], Second]:
+    """See `Run.ahead`."""
+    if thread_count() > 1:
+        made, result = side_by_side(run, first, second, span)
+        return lambda: made, result
+    found: list[First] = []
+
+    def late() -> First:
+        if not found:
+            # The bar stays where it is, and says what it waits for.
+            told = run._told
+            found.append(_within(run, first, lambda _, message: run.progress(told, message)))
+        return found[0]
+
+    result = _within(run, second, lambda done, message: run.progress(span[0] + (span[1] - span[0]) * done, message))
+    return late, result
+
+
+def _within(run: Run, function: Callable[[Run], Any], report: Callable[[float, str], None]) -> Any:
+    """What `function` returns for a part of `run` that is made now, in its stages and notes."""
+    part = replace(run, _overhead_seconds=0.0, _inner_seconds=0.0, _report=report, _checkpoints=None)
+    try:
+        return function(part)
+    finally:
+        run._overhead_seconds += part._overhead_seconds
+        run._inner_seconds += part._inner_seconds
 
 
 def _both(parts: tuple[_Part, _Part], first: Callable[[Run], Any], second: Callable[[Run], Any]) -> tuple[Any, Any]:

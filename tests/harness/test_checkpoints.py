@@ -103,7 +103,10 @@ def test_a_milestone_is_taken_at_once(tmp_path: Path) -> None:
 
 
 def test_the_marks_are_those_of_the_charts() -> None:
-    assert MARKS[:5] == (5, 10, 20, 40, 80)
+    assert MARKS[::2][:5] == pytest.approx((4.8, 9.6, 19.2, 38.4, 76.8))
+    # For each of the budgets that quality is told at, there is one not long before.
+    for budget in (10, 30, 60, 120, 300):
+        assert max(mark for mark in MARKS if mark < budget) > 0.7 * budget
 
 
 def test_taking_a_state_draws_no_random_numbers(tmp_path: Path) -> None:

@@ -110,3 +110,70 @@ def test_the_time_is_the_longer_parts_also_where_one_was_reused(
         run.side_by_side(first, second)
         assert run.fit_seconds(clock[0] - start) == pytest.approx(expected)
     assert run.reused == {"background": 50.0}
+
+
+def test_what_is_made_ahead_is_made_once_and_counted_where_it_was_asked_for(
+    cores: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    told: list[tuple[float, str]] = []
+
+    def first(run: Run) -> str:
+        with run.stage("first"):
+            time.sleep(0.05)
+        run.note("a", "1")
+        run.progress(0.1, "late")
+        made.append("first")
+        return "one"
+
+    def second(run: Run) -> int:
+        run.progress(0.5, "second")
+        made.append("second")
+        return 2
+
+    run = Run(_report=lambda fraction, message: told.append((fraction, message)))
+    late, result = run.ahead(first, second, span=(0.2, 0.4))
+    assert result == 2
+    assert (made == ["second"]) if cores == 1 else (sorted(made) == ["first", "second"])
+    run.progress(0.7, "on")
+    with run.stage("around"):
+        assert [late(), late()] == ["one", "one"]
+    assert sorted(made) == ["first", "second"]
+    assert run.notes == {"a": "1"}
+    assert run.stages["first"] >= 0.05
+    assert run.stages["around"] < 0.04
+    # The bar does not go back for what comes late.
+    fractions = [fraction for fraction, _ in told]
+    assert fractions == sorted(fractions)
+    if cores == 1:
+        assert told[0] == (pytest.approx(0.3), "second")
+        assert told[-1] == (0.7, "late")
+
+
+def test_a_late_error_is_the_callers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(side_by_side, "thread_count", lambda: 1)
+
+    def fails(run: Run) -> None:
+        raise SplashbenchError("no liquid")
+
+    late, _ = Run().ahead(fails, lambda run: None)
+    for _ in range(2):
+        with pytest.raises(SplashbenchError, match="no liquid"):
+            late()
+
+
+def test_a_stage_within_another_is_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    run = Run()
+    with run.stage("outer"):
+        clock[0] += 1
+        for _ in range(2):
+            with run.stage("inner"):
+                clock[0] += 10
+                with run.stage("innermost"):
+                    clock[0] += 100
+        clock[0] += 2
+    with run.stage("inner"):
+        clock[0] += 5
+    assert run.stages == {"outer": 3.0, "inner": 25.0, "innermost": 200.0}

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..carriers.subframe import CarrierState, Track
+from .cells import cell_numbers
 from .decoder import ColorCells
 from .targets import HIDDEN, TrainingTarget
 
@@ -117,7 +118,7 @@ class ActiveCarriers:
 def _cells(track: Track, t: int, size: float) -> Tensor:
     """The numbers of the cells, of `size` transport voxels, that frame `t`'s carriers are in: int64 [n]."""
     keys = np.floor(track.carriers.positions[track.carriers.rows(t)] / size).astype(np.int64)
-    return torch.from_numpy(np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1))
+    return torch.from_numpy(cell_numbers(keys))
 
 
 def chosen(values: Tensor, places: Tensor | None) -> Tensor:

@@ -17,7 +17,7 @@ from splashbench.scene.camera import Camera
 
 from ..kernel.window_loss import WindowPhotograph
 from .photographs import read_now
-from .targets import TrainingTarget
+from .targets import TrainingTarget, windowed
 
 
 def with_half_size(
@@ -35,6 +35,16 @@ def with_half_size(
     for target in targets:
         name = target.camera.name
         target.coarse = half_size(target, behind[name], before[name])
+
+
+def set_half_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
+    """Put others behind the `coarse` ones of `targets` where these have one, in place; see `with_half_size`."""
+    behind = {name: _halved(torch.from_numpy(image)) for name, image in backgrounds.items()}
+    for target in targets:
+        if target.coarse is not None:
+            x, y = target.corner
+            corner = (x // 2, y // 2)
+            target.coarse.background = windowed(behind[target.camera.name], corner, target.coarse.camera)
 
 
 def half_size(target: TrainingTarget, background: Tensor, wall: Tensor | None) -> TrainingTarget:

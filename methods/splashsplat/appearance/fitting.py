@@ -56,7 +56,8 @@ class FitSettings:
     `AdaptiveSchedule`. prune_opacity: carriers whose learned opacity is below this at one of `_PRUNINGS` are not
     fitted any further; 0 fits all to the end. feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is
     that of the shared parts. coarse_share: of the iterations, the first ones, that see targets at half
-    their size where these have one.
+    their size where these have one. plates_share: of the iterations, the first ones, for which the background is not
+    needed yet.
     """
 
     iterations: int = 1000
@@ -74,6 +75,7 @@ class FitSettings:
     prune_opacity: float = 0.0
     idle_share: float = 0.0
     coarse_share: float = 0.0
+    plates_share: float = 0.0
     weights: losses.LossWeights = field(default_factory=losses.LossWeights)
 
 
@@ -202,12 +204,14 @@ def fit_appearance(
     color_cell: float,
     seed: int,
     progress: Callable[[float], None],
-    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]]], None] | None = None,
+    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None = None,
+    settle: Callable[[], None] | None = None,
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
 
     offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, and the
-    carriers still fitted: bool [count].
+    carriers still fitted: bool [count]; and whether there will be no other for a while. settle: is called once, after
+    the share `plates_share`, to put the background behind `targets`.
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -292,6 +296,11 @@ def fit_appearance(
         if schedule.due(iteration):
             schedule.look(iteration, loss_of_withheld())
         factor = schedule.factor(iteration)
+        if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
+            if offer is not None and iteration >= len(targets):
+                offer(state, True)
+            settle()
+            settle = None
         if factor is None:
             break
         if not queue:
@@ -333,7 +342,7 @@ def fit_appearance(
         progress(schedule.done(iteration))
         # Until every photograph was seen once, there is less to see than before the fit, in a draft.
         if offer is not None and iteration >= len(targets):
-            offer(state)
+            offer(state, False)
     reader.close()
     appearance.features = features.all()
     return Fit(history, carriers.left(track.carriers.count))

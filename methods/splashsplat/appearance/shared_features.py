@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..carriers.population import Carriers
 from .active import chosen
+from .cells import cell_numbers
 from .optimizer import RowAdam
 
 
@@ -126,5 +127,4 @@ def cells_of(born: np.ndarray, size: float, frames: float, shift: np.ndarray) ->
     along x, y, z and time, in cells.
     """
     keys = np.floor(born / np.array([size, size, size, frames]) + shift).astype(np.int64)
-    _, cells = np.unique(keys, axis=0, return_inverse=True)
-    return cells.reshape(-1)
+    return cell_numbers(keys)

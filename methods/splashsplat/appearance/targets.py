@@ -127,6 +127,21 @@ def _modes(camera: Camera, box: tuple[int, int, int, int]) -> np.ndarray:
     return tile_modes(read)
 
 
+def set_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
+    """Put others behind `targets`, in place; backgrounds: as for `collect_targets`."""
+    for target in targets:
+        image = torch.from_numpy(backgrounds[target.camera.name])
+        target.background = windowed(image, target.corner, target.camera)
+
+
+def windowed(image: Tensor, corner: tuple[int, int], camera: Camera) -> Tensor:
+    """The part of a view's `image` [H, W, ...] that `camera` has, from column and row `corner` on; a [3] as it is."""
+    if image.ndim == 1:
+        return image
+    x, y = corner
+    return image[y : y + camera.height, x : x + camera.width]
+
+
 def collect_targets(
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],

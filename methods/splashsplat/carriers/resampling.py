@@ -89,16 +89,22 @@ def newborns(
     corners = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in inner), indexing="ij"), -1)
     centres = corners.reshape(-1, 3) + np.float32(0.5)
     middle = sample(phi, centres * np.float32(ratio))
-    centres = centres[(middle > -shell.depth - _HALF_DIAGONAL) & (middle < shell.outside + _HALF_DIAGONAL)]
+    near = (middle > -shell.depth - _HALF_DIAGONAL) & (middle < shell.outside + _HALF_DIAGONAL)
+    centres, middle = centres[near], middle[near]
     if len(centres) == 0:
         return np.zeros((0, 3), dtype=np.float32)
     population = np.bincount(cell_of(positions, grid), minlength=int(np.prod(grid.shape)))
     missing = target_population(phi, centres, ratio, shell) - population[cell_of(centres, grid)]
-    centres, missing = centres[missing > 0], missing[missing > 0]
-    # All cells draw the same number of candidates at once; each keeps the first that fall into the shell.
-    tries = _TRIES_PER_CARRIER * shell.max_per_cell
-    candidates = centres[:, None] + rng.random((len(centres), tries, 3), dtype=np.float32) - np.float32(0.5)
-    depth = sample(phi, candidates.reshape(-1, 3) * np.float32(ratio)).reshape(len(centres), tries)
+    short = missing > 0
+    centres, middle, missing = centres[short], middle[short], missing[short]
+    # Each cell draws candidates and keeps the first that fall into the shell: of a cell that lies in it most do.
+    cut = (middle < -shell.depth + _HALF_DIAGONAL) | (middle > shell.outside - _HALF_DIAGONAL)
+    tries = _TRIES_PER_CARRIER * np.where(cut, shell.max_per_cell, missing)
+    owner = np.repeat(np.arange(len(centres)), tries)
+    candidates = centres[owner] + rng.random((len(owner), 3), dtype=np.float32) - np.float32(0.5)
+    depth = sample(phi, candidates * np.float32(ratio))
     valid = (depth <= shell.outside) & (depth >= -shell.depth)
-    chosen = valid & (np.cumsum(valid, axis=1) <= missing[:, None])
-    return np.ascontiguousarray(candidates[chosen])
+    so_far = np.cumsum(valid)
+    starts = np.cumsum(tries) - tries
+    before = so_far[starts] - valid[starts]
+    return np.ascontiguousarray(candidates[valid & (so_far - before[owner] <= missing[owner])])

@@ -18,7 +18,7 @@ from splashbench.harness.contract import Run
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
 from splashbench.observe.grid import Bounds
 from splashbench.observe.kernels import resample
-from splashbench.observe.occlusion import ContainerOcclusion
+from splashbench.observe.occlusion import ContainerOcclusion, focal_length
 from splashbench.observe.reduced_masks import reduced
 from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
 from splashbench.scene.geometry import SignedDistance
@@ -32,15 +32,20 @@ from .rim import rim_of
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 8
+_REVISION = 9
+# The fewest hull cells that `voxel_pixels` leaves.
+_FEWEST_CELLS = 128
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """What phi_t depends on; see `SplashSplatConfig`. transport_cells: along the longest side, as hull_cells."""
+    """What phi_t depends on; see `SplashSplatConfig`. transport_cells: along the longest side, as hull_cells; both are
+    the most that there are, where voxel_pixels asks for fewer."""
 
     hull_cells: int
     transport_cells: int
+    voxel_pixels: float
+    clear_voxel_pixels: float
     signed_distance: SignedDistanceMethod
     container: bool
     container_masks: bool
@@ -158,7 +163,11 @@ def observe(
         run.note("rim", str(rim))
         container = container.with_mesh(rim.mesh)
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
-    hull_grid, grid = Grid.over(bounds, settings.hull_cells), Grid.over(bounds, settings.transport_cells)
+    seen_through = container is not None and not container.hides
+    voxel_pixels = settings.clear_voxel_pixels if seen_through else settings.voxel_pixels
+    hull_cells, transport_cells = _cells(bounds, scene, settings, voxel_pixels)
+    run.note("grid", f"{hull_cells} cells along the longest side of {bounds.longest_side:.3g}")
+    hull_grid, grid = Grid.over(bounds, hull_cells), Grid.over(bounds, transport_cells)
     occlusion = None
     if rim is not None:
         occlusion = rim.occlusion(hull_grid.voxel)
@@ -181,6 +190,26 @@ def observe(
                 find_jets=settings.ballistic,
             )
     return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues)
+
+
+def _cells(bounds: Bounds, scene: TrainingScene, settings: FieldSettings, voxel_pixels: float) -> tuple[int, int]:
+    """Cells of the hull grid and of the transport grid along the longest side, as the photographs need them."""
+    most = settings.hull_cells, settings.transport_cells
+    if voxel_pixels == 0:
+        return most
+    middle = (bounds.low + bounds.high) / 2
+    pixels = []
+    for camera in (scene.cameras[name] for name in scene.train):
+        depth = float((camera.w2c[2, :3] @ middle) + camera.w2c[2, 3])
+        if depth > 0:
+            pixels.append(depth / focal_length(camera))
+    if not pixels:
+        return most
+    needed = bounds.longest_side / (voxel_pixels * float(np.median(pixels)))
+    share = min(1.0, max(needed, min(_FEWEST_CELLS, settings.hull_cells)) / settings.hull_cells)
+    # The transport grid first, so that its voxels stay the same number of the hull's.
+    transport = max(2, round(share * settings.transport_cells))
+    return round(transport * settings.hull_cells / settings.transport_cells), transport
 
 
 def _bounds(

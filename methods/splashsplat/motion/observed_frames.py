@@ -29,7 +29,8 @@ _DISTANCES_DONE, _VELOCITIES_DONE = 0.5, 0.9
 class MotionSettings:
     """control_factor: transport voxels per control cell. gate: see gate.py. moves: False leaves out all motion.
 
-    control_cells: along every side of the box, in place of cubic cells; None for these.
+    control_cells: along every side of the box, in place of cubic cells; None for these. carry_on: start the fit of a
+    step from the motion of the one before, not from none.
     """
 
     control_factor: int
@@ -37,6 +38,7 @@ class MotionSettings:
     moves: bool = True
     velocity: VelocitySettings = field(default_factory=VelocitySettings)
     control_cells: int | None = None
+    carry_on: bool = False
 
     def factor(self, shape: tuple[int, int, int]) -> Factor:
         """Transport voxels per control cell on a transport grid of `shape`."""
@@ -113,6 +115,8 @@ class _MotionFit:
         shape = control_shape(observations.grid.shape, self.factor)
         #: no motion, on the control grid
         self.still = np.zeros((*shape, 3), dtype=np.float32)
+        # What the frame before has, before it was gated.
+        self._last = self.still
 
     def control(self, t: int, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """u_t on the control grid, float32 [cx, cy, cz, 3] voxels per frame."""
@@ -120,7 +124,8 @@ class _MotionFit:
         if not settings.moves:
             return self.still
         with self.run.stage("velocity"):
-            control = fit_velocity(before, after, factor, settings.velocity).control
+            start = self._last if settings.carry_on else None
+            control = self._last = fit_velocity(before, after, factor, settings.velocity, start).control
             return gated(control, factor, before, after) if settings.gate else control
 
     def fall(self, t: int) -> JetFall | None:

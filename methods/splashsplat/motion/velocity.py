@@ -212,7 +212,7 @@ class DivergenceFree:
 class VelocityFit:
     """u between two frames as control values float32 [cx, cy, cz, 3], voxels per frame, and how well it explains them.
 
-    residual_before, residual: mean |phi[t+1](q) - phi[t](q - u(q))| over the band, voxels, without motion and with u.
+    residual_before, residual: mean |phi[t+1](q) - phi[t](q - u(q))| over the band, voxels, at the start and with u.
     """
 
     control: np.ndarray
@@ -221,11 +221,16 @@ class VelocityFit:
 
 
 def fit_velocity(
-    before: np.ndarray, after: np.ndarray, factor: Factor, settings: VelocitySettings | None = None
+    before: np.ndarray,
+    after: np.ndarray,
+    factor: Factor,
+    settings: VelocitySettings | None = None,
+    start: np.ndarray | None = None,
 ) -> VelocityFit:
     """Fit u_t to phi_t (`before`) and phi_{t+1} (`after`), float32 [nx, ny, nz] in voxels of their grid.
 
-    factor: transport voxels per control cell. Zero motion where either frame has no liquid.
+    factor: transport voxels per control cell. start: the control values that the descent starts from, by default no
+    motion. Zero motion where either frame has no liquid.
     """
     settings = settings or VelocitySettings()
     coarse = control_shape(before.shape, factor)
@@ -233,6 +238,8 @@ def fit_velocity(
     band = (np.abs(before) < settings.band) | (np.abs(after) < settings.band)
     if not band.any() or not (before < 0).any() or not (after < 0).any():
         return VelocityFit(control, 0.0, 0.0)
+    if start is not None:
+        control += start
     nodes = np.argwhere(band).astype(np.int32)
     cell = cell_numbers(nodes, factor, coarse)
     order = np.argsort(cell, kind="stable")

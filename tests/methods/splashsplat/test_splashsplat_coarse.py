@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splashbench.scene.camera import Camera, look_at
-from splashbench_methods.splashsplat.appearance.coarse import with_half_size
+from splashbench_methods.splashsplat.appearance.coarse import set_half_backgrounds, with_half_size
 from splashbench_methods.splashsplat.appearance.photographs import Deferred, ReadAhead, Shelf, read_now
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
@@ -112,6 +112,13 @@ def test_windows_of_one_image_share_its_half() -> None:
         np.testing.assert_allclose(float(coarse.wall[1, 3]), wall[y + 2 : y + 4, x + 6 : x + 8].mean(), rtol=1e-6)
         storages.add(coarse.background.untyped_storage().data_ptr())
     assert len(storages) == 1
+    # Another background is halved in the same way.
+    expected = [made.coarse.background.clone() for made in targets if made.coarse]
+    with_half_size(targets, {"1": np.zeros_like(whole)}, {"1": wall})
+    set_half_backgrounds(targets, {"1": whole})
+    for made, wanted in zip(targets, expected, strict=True):
+        assert made.coarse is not None
+        assert torch.equal(made.coarse.background, wanted)
 
 
 def test_photographs_beyond_the_room_are_read_again_each_time() -> None:

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from splashbench.errors import SplashbenchError
+from splashbench.files.images import read_image, write_png
+from splashbench.harness import side_by_side
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig
+from splashbench_methods import scaffold_gs
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method
+from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.appearance.first_look import Look, photographed, take_on
 from splashbench_methods.splashsplat.appearance.fitting import Appearance
@@ -113,3 +118,54 @@ def test_no_draft_where_none_is_asked_for(balls: Scene, tmp_path: Path) -> None:
     SplashSplat().fit(balls.training(), SplashSplatConfig.preset("quick", TINY | {"draft_cells": 0}), run)
     assert run._checkpoints.seconds == []
     assert "draft" not in run.stages
+
+
+def test_the_background_comes_after_the_first_iterations(
+    balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Clean plates are behind the liquid until then, and states are taken before it."""
+    monkeypatch.setattr(side_by_side, "thread_count", lambda: 1)
+    scene = balls.training()
+    shown: list[bool] = []
+    loss = fitting.image_loss
+
+    def note(*arguments):
+        shown.append(len(calls) > 0)
+        return loss(*arguments)
+
+    calls: list[int] = []
+    fit_background = scaffold_gs.shared_background
+
+    def background(*arguments):
+        calls.append(len(shown))
+        return fit_background(*arguments)
+
+    monkeypatch.setattr(fitting, "image_loss", note)
+    monkeypatch.setattr(scaffold_gs, "shared_background", background)
+    settings = TINY | {"draft_cells": 0, "validation_share": 0.0, "iterations": 100}
+    for share, before in ((0.0, 0), (0.4, 40), (1.0, 100)):
+        shown.clear()
+        calls.clear()
+        config = SplashSplatConfig.preset("quick", settings | {"plates_share": share})
+        run = Run(seed=1)
+        run._checkpoints = Checkpoints(tmp_path / str(share), [], lambda: 7.0, lambda: None)
+        fitted = SplashSplat().fit(scene, config, run)
+        assert calls == [before]
+        assert shown.count(False) == before
+        assert len(fitted.background.model) > 0
+        # The last state before the wait, once each photograph was seen.
+        seen = sum(bool(scene.mask(name, t).any()) for name in scene.train for t in range(scene.n_frames))
+        assert run._checkpoints.seconds == ([7.0] if before >= seen else [])
+        if before >= seen:
+            state = SplashSplat().load(tmp_path / str(share) / "00", scene)
+            assert len(state.background.model) == 0
+
+
+def test_masks_that_leave_no_background_are_refused_at_once(balls_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in (balls_copy / "seg").rglob("*.png"):
+        write_png(path, np.full_like(read_image(path), 255))
+    scene = Scene.open(balls_copy).training()
+    assert all(scene.mask(name, t).all() for name in scene.train for t in range(scene.n_frames))
+    monkeypatch.setattr(method, "trace_liquid", lambda *arguments: pytest.fail("minutes went by first"))
+    with pytest.raises(SplashbenchError, match=r"liquid masks cover every training view throughout; fix the masks"):
+        SplashSplat().fit(scene, SplashSplatConfig.preset("best", TINY), Run(seed=1))

@@ -111,6 +111,21 @@ def test_velocity_is_zero_where_nothing_moves_or_nothing_is():
     assert (fit_velocity(nothing, ball((20, 20, 20)), FACTOR).control == 0).all()
 
 
+def test_a_fit_that_carries_on_needs_fewer_steps():
+    """A ball that moves on by the same 3 voxels, from the motion of the step before and from none."""
+    places = [ball((x, 20, 20)) for x in (14.0, 17.0, 20.0)]
+    first = fit_velocity(places[0], places[1], FACTOR).control
+    few = VelocitySettings(steps=4)
+    cold = fit_velocity(places[1], places[2], FACTOR, few)
+    warm = fit_velocity(places[1], places[2], FACTOR, few, first)
+    assert warm.residual_before < 0.5 * cold.residual_before
+    assert warm.residual < 0.5 * cold.residual
+    # What the liquid does not say any more is not kept: it stands still again.
+    still = fit_velocity(places[1], places[1], FACTOR, VelocitySettings(steps=35), first)
+    assert np.abs(surface_motion(still, places[1])).max() < 0.2
+    np.testing.assert_array_equal(fit_velocity(places[0], places[1], FACTOR).control, first)
+
+
 def test_velocity_never_exceeds_its_limit():
     fit = fit_velocity(ball((15, 20, 20)), ball((22, 20, 20)), FACTOR, VelocitySettings(limit=2.0))
     assert np.linalg.norm(fit.control, axis=-1).max() <= 2.0 + 1e-5

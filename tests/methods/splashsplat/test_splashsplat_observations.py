@@ -126,3 +126,24 @@ def test_progress_never_goes_back(balls: Scene, tmp_path: Path) -> None:
         _observed(balls, run, lambda done, what, progress=progress: progress.append(done))  # type: ignore[misc]
         assert progress == sorted(progress)
         assert progress[-1] == 1
+
+
+def test_grids_are_no_finer_than_the_photographs(balls: Scene) -> None:
+    def grids(**settings: object) -> tuple[int, int, float]:
+        config = SplashSplatConfig.model_validate({"hull_cells": 300, "transport_cells": 150, **settings})
+        observed = observe(balls.training(), config.fields, Run(), lambda done, what: None)
+        sides = [max(grid.shape) - 1 for grid in (observed.hull_grid, observed.grid)]
+        middle = observed.hull_grid.to_scene((np.array(observed.hull_grid.shape) - 1) / 2)
+        pixels = [
+            float(np.linalg.norm(camera.center - middle)) / camera.K[0, 0]
+            for camera in (balls.cameras[name] for name in balls.train)
+        ]
+        return sides[0], sides[1], observed.hull_grid.voxel / float(np.median(pixels))
+
+    assert grids(voxel_pixels=0)[:2] == (300, 150)
+    hull, transport, pixels = grids(voxel_pixels=0.2)
+    assert hull == 2 * transport < 300
+    assert pixels == pytest.approx(0.2, rel=0.05)
+    # There are some cells however small the photographs, and no more than asked for.
+    assert grids(voxel_pixels=16)[:2] == (128, 64)
+    assert grids(voxel_pixels=16, hull_cells=64, transport_cells=32)[:2] == (64, 32)
