@@ -159,6 +159,16 @@ def test_quality_over_time_is_that_of_the_committed_results() -> None:
             for part, metric, digits in zip(cell.split("/"), ("psnr", "lpips", "miou"), (2, 4, 3), strict=True):
                 value = measured[name, metric, seconds.removesuffix(" s")]
                 assert float(part.strip(" *†")) == pytest.approx(value, abs=0.51 * 10**-digits)
+    leads = {(seconds, metric): (row, float(value)) for row, metric, seconds, value in lines if row.startswith("lead")}
+    _, _, *table = tables("speed.md")[1]
+    assert [line[0] for line in table] == ["10 s", "30 s", "60 s", "120 s", "300 s"]
+    for seconds, rival, lead, interval, share, worst in table:
+        at = seconds.removesuffix(" s")
+        assert leads[at, "psnr"][0] == f"lead over {rival}"
+        low, high = interval.split(" to ")
+        for metric, cell in (("psnr", lead), ("low", low), ("high", high), ("worst", worst)):
+            assert float(cell.strip("*")) == pytest.approx(leads[at, metric][1], abs=0.0051)
+        assert float(share.removesuffix(" %")) == pytest.approx(100 * leads[at, "share"][1], abs=0.51)
 
 
 def test_told_all_is_what_was_measured() -> None:
