@@ -22,6 +22,7 @@ from scipy import ndimage
 
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
+from splashbench.errors import SplashbenchError
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.report.results import ResultFile
@@ -29,6 +30,8 @@ from splashbench.scene import Scene
 from splashbench.score.metrics import METRICS
 from splashbench.score.result import Digests, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1
+from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
+from splashbench.study.scenes import recording_of
 from splashbench.submission import Submission
 from splashbench_methods.splashsplat.fields.container import known_container
 from splashbench_methods.splashsplat.fields.near_wall import near_wall
@@ -237,6 +240,45 @@ def vessels() -> list[Path]:
     return [store(figure, "method_vessel.png", 130)]
 
 
+def perturbations() -> list[Path]:
+    """A training view with each kind of perturbation at its fourth severity; masks as outlines."""
+    folder = WORK / "opaque_bowl_recorded"
+    made(folder, "synth", "scene", "opaque_bowl", str(folder), "--size", "360x240", "--timesteps", "24")
+    scene = Scene.open(folder)
+    given = recording_of(scene)
+    figure = Figure(figsize=(12, 9.6), layout="constrained")
+    panels = iter(figure.subplots(5, 6).flat)
+    for kind in (None, *KINDS):
+        worse = given if kind is None else _worse(given, kind, scene.name)
+        title = "as it is" if kind is None else kind.named().replace("_", " ")
+        name, t = _most_changed(given, worse)
+        image = worse.image(name, t).copy()
+        outline = ndimage.binary_dilation(worse.mask(name, t)) ^ worse.mask(name, t)
+        image[outline] = (230, 159, 0)
+        bare(next(panels), title).imshow(image[20:190, 80:290])
+    return [store(figure, "perturbations.png", 100)]
+
+
+def _worse(given: Recording, kind: type[Step], name: str) -> Recording:
+    """`given` with `kind` at its fourth severity, or its fifth where frames are too far apart for that."""
+    try:
+        return perturbed(given, [kind.at(kind.ladder[3])], Dice(0, name))
+    except SplashbenchError:
+        return perturbed(given, [kind.at(kind.ladder[4])], Dice(0, name))
+
+
+def _most_changed(given: Recording, worse: Recording) -> tuple[str, int]:
+    """The view and the timestep, of some late ones, that show a change best."""
+    times = range(given.n_frames // 2, given.n_frames, 3)
+    return max(
+        ((name, t) for name in given.views for t in times),
+        key=lambda at: (
+            float(np.abs(worse.image(*at).astype(int) - given.image(*at)).mean())
+            + 255 * float((worse.mask(*at) ^ given.mask(*at)).mean())
+        ),
+    )
+
+
 def rims() -> list[Path]:
     """A rim as the container masks have it, and moved to where liquid masks end, over a view of a pool; and the
     wall's share of its pixels."""
@@ -332,6 +374,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "method": method,
     "vessels": vessels,
     "rims": rims,
+    "perturbations": perturbations,
     "tutorial": tutorial,
 }
 

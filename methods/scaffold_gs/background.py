@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,10 @@ _FILE = "background.npz"
 _LEAST_OPACITY = 0.05
 
 
+#: Training views without their liquid, by name.
+Plates = Mapping[str, CleanPlate]
+
+
 class Background:
     """A fitted static scene. `far_color` [3] is what shows where no Gaussian lies."""
 
@@ -46,6 +50,10 @@ class Background:
         """The liquid-free view of `camera`, float32 [H, W, 3] in [0, 1]."""
         rgb, _ = rasterize_arrays(*self.gaussians(camera), camera, background=self.far_color)
         return np.clip(rgb, 0, 1)
+
+    def seen_by(self, scene: TrainingScene) -> dict[str, NDArray[np.float32]]:
+        """What the training views of `scene` show of it, float32 [H, W, 3] each; see `render`."""
+        return {name: np.asarray(self.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()}
 
     def depth(self, camera: Camera) -> NDArray[np.float32]:
         """Expected depth along the optical axis of `camera`, float32 [H, W], scene units; inf where nothing lies.
@@ -140,24 +148,33 @@ def _covered(scene: TrainingScene, when: str) -> SplashbenchError:
     return SplashbenchError(f"{scene.directory}: liquid masks cover every training view {when}; fix the masks")
 
 
-def flat_background(
-    scene: TrainingScene, n_frames: int = MAX_FRAMES
-) -> tuple[Background, dict[str, NDArray[np.float32]]]:
-    """For who cannot wait: a background of one colour, and what lies behind the liquid in each training view.
+def clean_plates(scene: TrainingScene, n_frames: int = MAX_FRAMES) -> Plates:
+    """The plate of every training view of `scene`, in its size, of at most `n_frames` frames.
 
-    That is the median of `n_frames` frames where they are free of liquid, and where none is the colour, the median of
-    all that is: float32 [H, W, 3]. Raises SplashbenchError where masks cover everything in more than one frame.
+    Raises SplashbenchError where masks cover everything in more than one frame.
     """
     plates = {}
     for name in scene.train:
         camera = scene.cameras[name]
         plates[name] = make_clean_plate(scene, name, max(camera.width, camera.height), n_frames)
-    seen = np.concatenate([plate.image[plate.seen] for plate in plates.values()])
-    if not len(seen) and n_frames > 1:
+    if n_frames > 1 and not any(plate.seen.any() for plate in plates.values()):
         raise _covered(scene, "throughout")
+    return plates
+
+
+def flat_background(plates: Plates) -> Background:
+    """For who cannot wait: a background of one colour, the median of all that `plates` show."""
+    seen = np.concatenate([plate.image[plate.seen] for plate in plates.values()])
     color = (np.median(seen, axis=0) / 255).astype(np.float32) if len(seen) else np.full(3, 0.5, np.float32)
-    behind = {name: np.where(plate.seen[..., None], plate.floats(), color) for name, plate in plates.items()}
-    return Background(AnchorModel(0, StaticAnchorSpec(1)), color), behind
+    return Background(AnchorModel(0, StaticAnchorSpec(1)), color)
+
+
+def completed(plates: Plates, background: Background) -> dict[str, NDArray[np.float32]]:
+    """The views of `plates` with what `background` shows where they show nothing: float32 [H, W, 3] each."""
+    return {
+        name: np.where(plate.seen[..., None], plate.floats(), background.render(plate.camera))
+        for name, plate in plates.items()
+    }
 
 
 def _hull_points(scene: TrainingScene, count: int) -> NDArray[np.float32]:

@@ -1,35 +1,72 @@
 """A first reconstruction within seconds, for those who look at a fit on its way. Not in the paper.
 
 It is the method itself on coarse grids: carriers of each frame alone, which nothing moves, fitted for a moment to the
-photographs. The background of a fit is not there yet. Before it, the training views have what they show at first, and
-others one colour.
+photographs, before one colour at first and then before a background as coarse. Nothing of it enters the fit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.scene.scene import TrainingScene
 
 from .fields.container import KnownContainer
 from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
-from .reconstruction import fit_liquid, trace_liquid
+from .reconstruction import Reconstruction, fit_liquid, trace_liquid
 from .settings import SplashSplatConfig
 
 if TYPE_CHECKING:
-    from ..scaffold_gs import Background
+    from ..scaffold_gs import Background, Plates
+
+# Of the background: a second or two.
+_ITERATIONS, _ANCHORS, _LONGEST_SIDE = 80, 5000, 160
+
+#: The liquid, what lies behind it, and what hides the liquid from cameras.
+Draft = tuple[Liquid, "Background", LiquidOcclusion | None]
 
 
 def make_draft(
-    scene: TrainingScene, config: SplashSplatConfig, seed: int, known: KnownContainer
-) -> tuple[Liquid, Background, LiquidOcclusion | None]:
-    """The liquid, a background of one colour, and what hides the liquid from cameras. config: that of the fit."""
-    from ..scaffold_gs import flat_background
+    scene: TrainingScene,
+    config: SplashSplatConfig,
+    seed: int,
+    known: KnownContainer,
+    plates: Callable[[], Plates],
+    offer: Callable[[Callable[[], Draft], bool], None],
+) -> Background:
+    """Fit a draft of `scene`; returns its background.
 
-    background, behind = flat_background(scene, n_frames=1)
+    config: that of the fit. plates: gives what the training views show without the liquid. offer: is given what makes
+    the draft as it is, and whether there will be no other for a while; at the end, too.
+    """
+    from ..scaffold_gs import BackgroundSettings, clean_plates, completed, fit_background, flat_background
+
+    first = clean_plates(scene, n_frames=1)
+    background = flat_background(first)
     # A run of its own: nothing in it counts as a stage, a note or a part that others may take over.
     run, coarse = Run(seed=seed), config.draft()
-    liquid, occlusion = fit_liquid(scene, behind, trace_liquid(scene, coarse, run, known), run)
-    return liquid, background, occlusion
+
+    def settled() -> dict[str, np.ndarray]:
+        nonlocal background
+        settings = BackgroundSettings(iterations=_ITERATIONS, max_anchors=_ANCHORS, longest_side=_LONGEST_SIDE)
+        with one_torch_thread():
+            background = fit_background(scene, settings, run)
+        # Plates are sharper than so coarse a background.
+        return completed(plates(), background)
+
+    def offer_state(state: Callable[[], Reconstruction], milestone: bool) -> None:
+        offer(lambda: complete(state()), milestone)
+
+    def complete(found: Reconstruction) -> Draft:
+        liquid, occlusion = found
+        return liquid, background, occlusion
+
+    traced = trace_liquid(scene, coarse, run, known)
+    found = fit_liquid(scene, completed(first, background), traced, run, offer=offer_state, settled=settled)
+    offer(lambda: complete(found), True)
+    return background

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -129,11 +130,6 @@ class FittedSplashSplat(Fitted):
             self.occlusion.save(static)
 
 
-def _seen_by_all(background: Background, scene: TrainingScene) -> dict[str, np.ndarray]:
-    """What each training view of `scene` shows of `background`, float32 [H, W, 3]."""
-    return {name: np.asarray(background.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()}
-
-
 class SplashSplat(Method):
     """Carriers moved by a fitted velocity field, corrected and refilled by the hull, decoded into Gaussians."""
 
@@ -154,7 +150,7 @@ class SplashSplat(Method):
 
         Where there are cores, the background is fitted beside the carriers, and else once it is needed.
         """
-        from ..scaffold_gs import flat_background, shared_background
+        from ..scaffold_gs import clean_plates, completed, flat_background, shared_background
 
         if config.variant == "flip":
             metric_gravity(scene)  # an error now rather than after the background
@@ -163,20 +159,30 @@ class SplashSplat(Method):
             with part.stage("background"), one_torch_thread():
                 return shared_background(scene, config.background, part)
 
-        known = None
+        plates = cache(lambda: clean_plates(scene))
+        known, drafted = None, None
         if run.watched and config.draft_cells > 0:
             run.progress(0, "draft")
             with run.stage("draft"):
                 known = known_container(scene, config.container, config.container_masks)
-                draft = FittedSplashSplat(*make_draft(scene, config, run.seed, known))
-            run.checkpoint(lambda: draft, milestone=True)
+                drafted = make_draft(
+                    scene,
+                    config,
+                    run.seed,
+                    known,
+                    plates,
+                    lambda state, milestone: run.checkpoint(lambda: FittedSplashSplat(*state()), milestone),
+                )
         deferred = config.plates_share > 0 and config.composition != "together"
         behind: dict[str, np.ndarray]
         frozen: dict[str, Frozen] | None = None
         settled: Callable[[], dict[str, np.ndarray]] | None = None
         if deferred:
             with run.stage("background"):
-                background, behind = flat_background(scene)
+                background = flat_background(plates())
+                behind = completed(plates(), background)
+            # What is shown on the way; the liquid is fitted before the plates, whether there was a draft or not.
+            background = drafted or background
         late, traced = run.ahead(
             fit_background, lambda part: trace_liquid(scene, config, part, known), span=(0, _BEFORE)
         )
@@ -188,13 +194,13 @@ class SplashSplat(Method):
             }
         elif not deferred:
             background = late()
-            behind = _seen_by_all(background, scene)
+            behind = background.seen_by(scene)
         else:
 
             def settled() -> dict[str, np.ndarray]:
                 nonlocal background
                 background = late()
-                return _seen_by_all(background, scene)
+                return background.seen_by(scene)
 
         def offer(state: Callable[[], Reconstruction], milestone: bool) -> None:
             run.checkpoint(lambda: FittedSplashSplat(*with_background(*state())), milestone)

@@ -30,8 +30,11 @@ if TYPE_CHECKING:
     from ..scaffold_gs import BackgroundSettings
 
 
-# Of the draft: what a second or two allow.
-_DRAFT_ITERATIONS = 300
+# Of the draft: what a few seconds allow, and the share of them before its background.
+_DRAFT_ITERATIONS = 1000
+_DRAFT_PLATES_SHARE = 0.25
+# And the edge of its hull voxels in pixels, and how few there are at least.
+_DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
 VERSION = "13"
@@ -47,6 +50,8 @@ class SplashSplatConfig(MethodConfig):
     voxel_pixels: float = Field(0.6, ge=0, le=16)
     #: the same in a transparent container, whose liquid is seen through its sides
     clear_voxel_pixels: float = Field(0.8, ge=0, le=16)
+    #: hull cells along the longest side that `voxel_pixels` and `clear_voxel_pixels` leave at least
+    fewest_cells: int = Field(128, ge=16, le=512)
     transport_cells: int = Field(150, ge=16, le=256)
     control_cells: int = Field(38, ge=4, le=128)
     #: control cells are "cubes", `control_cells` of them along the longest side, or along every one of the "sides" of
@@ -171,8 +176,9 @@ class SplashSplatConfig(MethodConfig):
     plates_share: float = Field(0.2, ge=0, le=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "brief", "quick"] = "brief"
-    #: hull cells of a draft that is made first where states of the fit are taken (`run --checkpoints`); 0 for none
-    draft_cells: int = Field(80, ge=0, le=512)
+    #: hull cells, at the most, of a draft that is made first where states of the fit are taken (`run --checkpoints`);
+    #: 0 for none
+    draft_cells: int = Field(140, ge=0, le=512)
 
     renamed: ClassVar[Mapping[str, str]] = {
         "distance": "signed_distance",
@@ -284,6 +290,7 @@ class SplashSplatConfig(MethodConfig):
             transport_cells=self.transport_cells,
             voxel_pixels=self.voxel_pixels,
             clear_voxel_pixels=self.clear_voxel_pixels,
+            fewest_cells=self.fewest_cells,
             signed_distance=self.signed_distance,
             container=self.container,
             container_masks=self.container_masks,
@@ -327,6 +334,9 @@ class SplashSplatConfig(MethodConfig):
             update={
                 "hull_cells": max(16, self.draft_cells),
                 "transport_cells": max(16, self.draft_cells // 2),
+                "voxel_pixels": _DRAFT_PIXELS,
+                "clear_voxel_pixels": _DRAFT_PIXELS,
+                "fewest_cells": _DRAFT_FEWEST,
                 "control_cells": 4,
                 "detect_failed_masks": False,
                 "tight_bounds": False,
@@ -340,7 +350,7 @@ class SplashSplatConfig(MethodConfig):
                 "iterations": _DRAFT_ITERATIONS,
                 "validation_share": 0.0,
                 "idle_share": 0.0,
-                "plates_share": 0.0,
+                "plates_share": _DRAFT_PLATES_SHARE,
             }
         )
 

@@ -1,4 +1,7 @@
-"""`splashbench study run SPEC OUT`: a table of runs that shows what a part of a method or of its input is worth."""
+"""`splashbench study run SPEC OUT`: a table of runs that shows what a part of a method or of its input is worth.
+
+`splashbench study stress OUT`: what methods keep where recordings are worse.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import argparse
 import shlex
 from pathlib import Path
 
-from splashbench.cli.arguments import add_lpips_weights, add_settings, whole_number
+from splashbench.cli.arguments import add_lpips_weights, add_settings, positive_number, whole_number
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say
 
@@ -20,6 +23,17 @@ examples:
 SPEC is a TOML file, or one of: ablation, baselines, best, interpolation, masks, sensitivity, views
 (docs/study.md). OUT gets table.md, table.csv, runs.csv, table.json, chart.png and chart.svg. The same command again
 continues where it stopped. Failed runs have rows of their own.
+"""
+
+_STRESS_EPILOG = """\
+examples:
+  splashbench study stress OUT --methods splashsplat:quick spacetime_gaussians --scenes scenes/bowl_001
+  splashbench study stress OUT --methods my.py:Mine --scenes SCENE --severities 1 3 5 --kinds pose_rotation exposure
+  splashbench study stress OUT --methods splashsplat --scenes SCENE --seeds 0 1 2 --jobs 2
+  splashbench study stress OUT --methods splashsplat --scenes DENSE --every 4     clocks off by part of a timestep
+
+Training views alone are made worse; test views stay. OUT gets stability.md with a chart, and stability.csv,
+breakdown.csv and retention.csv. The same command again continues where it stopped. A run that fails keeps nothing.
 """
 
 
@@ -67,6 +81,140 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--retry", action="store_true", help="repeat failed runs")
     parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
     add_lpips_weights(parser)
+
+    _register_stress(actions)
+
+
+def _register_stress(actions: argparse._SubParsersAction) -> None:
+    parser = add_command(
+        actions,
+        "stress",
+        stress,
+        summary="make recordings worse, and see where methods break",
+        description=(
+            "Run methods on scenes whose training views were made worse in every way, at five severities each,\n"
+            "and tell what they keep: stability S, CVaR10 and the points at which they break."
+        ),
+        epilog=_STRESS_EPILOG,
+    )
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; finished runs in it are reused")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        action="extend",
+        required=True,
+        metavar="METHOD[:PRESET]",
+        help="what is run: names of methods, or FILE.py:CLASS; the preset is a method's first by default",
+    )
+    parser.add_argument(
+        "--scenes", nargs="+", action="extend", required=True, metavar="SCENE", help="folders of scenes"
+    )
+    parser.add_argument(
+        "--kinds",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KIND",
+        help="what is made worse, such as clock_offset or exposure (docs/study.md has all; default: every kind)",
+    )
+    parser.add_argument(
+        "--severities",
+        nargs="+",
+        action="extend",
+        type=whole_number(1, 5),
+        default=[],
+        metavar="1-5",
+        help="which of the five (default: all)",
+    )
+    parser.add_argument(
+        "--seeds",
+        nargs="+",
+        action="extend",
+        type=whole_number(0),
+        default=[],
+        metavar="SEED",
+        help="of methods and of what is drawn (default: 0)",
+    )
+    parser.add_argument(
+        "--every",
+        type=whole_number(1),
+        default=1,
+        metavar="K",
+        help="use each K-th timestep of the scenes; the frames between serve harm in milliseconds (default: 1)",
+    )
+    parser.add_argument(
+        "--timeout",
+        type=positive_number("minutes"),
+        metavar="MINUTES",
+        help="for each fit, and again for each rendering; a run that takes longer keeps nothing",
+    )
+    parser.add_argument(
+        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
+    )
+    parser.add_argument("--retry", action="store_true", help="repeat failed runs")
+    add_lpips_weights(parser)
+
+
+def stress(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench study stress`."""
+    from splashbench.scene import Scene
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed
+    from splashbench.study.job import Store
+    from splashbench.study.stress import make_stress_plan
+    from splashbench.study.stress_report import write_stress_report
+    from splashbench.study.thinning import thinned
+
+    store = Store(arguments.out)
+
+    def thin(scene: Scene) -> Scene:
+        if arguments.every == 1:
+            return scene
+        with claimed(store):
+            return thinned(scene, arguments.every, store.cache / "thinned")
+
+    planned = make_stress_plan(
+        arguments.methods,
+        arguments.scenes,
+        kinds=arguments.kinds,
+        levels=arguments.severities or (1, 2, 3, 4, 5),
+        seeds=list(dict.fromkeys(arguments.seeds)) or [0],
+        timeout_seconds=60 * arguments.timeout if arguments.timeout else None,
+        thin=thin,
+    )
+    for harm, reason in planned.left_out:
+        say(f"left out: {harm.kind.named()} {harm.amount:g} {harm.kind.unit}: {reason}")
+    say(
+        f"{len(planned.plan.runs)} runs: {len(planned.methods)} methods, {len(planned.harms)} harms and none, "
+        f"{len(planned.plan.scenes)} scenes, {len(planned.plan.spec.seeds)} seeds"
+    )
+    options = ExecutionOptions(
+        jobs=arguments.jobs, retry=arguments.retry, lpips_weights=arguments.lpips_weights, tell=say
+    )
+    tally = carry_out_plan(planned.plan, arguments.out, options)
+    files = write_stress_report(planned, store, arguments.out, _stress_command(arguments))
+    say(f"{tally.made} runs made" + (f", {tally.reused} reused" if tally.reused else ""))
+    for file in files:
+        say(f"wrote {file}")
+    if arguments.json:
+        emit(
+            {
+                "out": str(arguments.out),
+                "made": tally.made,
+                "kept": tally.reused,
+                "left_out": [f"{harm.kind.named()} {harm.amount:g}" for harm, _ in planned.left_out],
+                "files": [str(file) for file in files],
+            }
+        )
+    return 0
+
+
+def _stress_command(arguments: argparse.Namespace) -> str:
+    words = ["splashbench", "study", "stress", str(arguments.out)]
+    for flag in ("methods", "scenes", "kinds", "severities", "seeds"):
+        values = getattr(arguments, flag)
+        words += [f"--{flag}", *map(str, values)] if values else []
+    words += ["--every", str(arguments.every)] if arguments.every > 1 else []
+    return shlex.join(words)
 
 
 def run(arguments: argparse.Namespace) -> int:

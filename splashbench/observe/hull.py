@@ -13,7 +13,7 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.observe.grid import Bounds, Grid
-from splashbench.observe.kernels import carve_view, fill_blocks
+from splashbench.observe.kernels import BLOCK, blocks_of, carve_view, fill_blocks
 from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion, focal_length
 from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
 from splashbench.parallel import each
@@ -21,14 +21,12 @@ from splashbench.parallel import each
 SEARCH_CELLS = 64
 REFINED_CELLS = 96
 
-# Nodes along the edge of a block, and along a grid's shortest side from which blocks are worth it.
-_BLOCK = 4
+# Nodes along a grid's shortest side from which blocks are worth it.
 _WORTH_BLOCKS = 48
-# By how much a node may be less outside than the corners of its block, voxels: over the block's diagonal, distances
-# change by no more than 1.5 voxels a voxel, where views are no wider than 90 degrees.
-_REACH = 1.5 * 3**0.5 * _BLOCK
-# What is told apart at corners, in voxels of their grid.
-_FARTHEST = (LIMIT_VOXELS + _REACH) / _BLOCK + 1
+# From the middle of a block to its farthest node, voxels.
+_HALF = 0.5 * (BLOCK - 1) * 3**0.5
+# By how much a distance read between pixels may miss what its slope of one allows, pixels.
+_BETWEEN_PIXELS = 0.6
 
 #: the 2-D signed distance s_v of view number v, of a window of its image
 Distance = Callable[[int, ImageWindow | None], np.ndarray]
@@ -40,29 +38,28 @@ def carve(
     """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v."""
     phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32) if container is None else container.outside.copy()
     carvers = each(lambda view: _Carver(silhouettes, view, distance, container), range(len(silhouettes.cameras)))
+    blocks: list[np.ndarray] | list[None] = [None] * len(carvers)
     if min(grid.shape) >= _WORTH_BLOCKS:
-        fill_blocks(phi, _far_blocks(grid, carvers), _BLOCK, LIMIT_VOXELS)
-    for carver in carvers:
-        carver.carve(phi, grid)
+        far, blocks = _blocks(grid, carvers)
+        fill_blocks(phi, far, LIMIT_VOXELS)
+    for carver, wanted in zip(carvers, blocks):
+        carver.carve(phi, grid, wanted)
     return phi
 
 
-def _far_blocks(grid: Grid, carvers: list[_Carver]) -> np.ndarray:
-    """The blocks in which every node is LIMIT_VOXELS or more outside: bool [bx, by, bz].
+def _blocks(grid: Grid, carvers: list[_Carver]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The blocks in which every node is LIMIT_VOXELS or more outside; and of each view those of the others in which it
+    may say more than all other views: bool, see `blocks_of`.
 
-    Told from their corners, on a grid that is so much coarser. Most nodes are in such blocks, and need no look of
-    their own.
+    Told from their middles, on a grid that is so much coarser. Most nodes are in far blocks, and near to others one
+    view often says more than the rest.
     """
-    nx, ny, nz = (-(-n // _BLOCK) + 1 for n in grid.shape)
-    corners = Grid(grid.origin, grid.voxel * _BLOCK, (nx, ny, nz))
-    phi = np.full(corners.shape, -_FARTHEST, dtype=np.float32)
-    for carver in carvers:
-        carver.carve_least(phi, corners)
-    far = phi * _BLOCK >= LIMIT_VOXELS + _REACH
-    for axis in range(3):
-        count = far.shape[axis] - 1
-        far = np.take(far, range(count), axis=axis) & np.take(far, range(1, count + 1), axis=axis)
-    return far
+    middles = Grid(grid.origin + 0.5 * (BLOCK - 1) * grid.voxel, grid.voxel * BLOCK, blocks_of(grid.shape))
+    bounds = [carver.bounds(middles, grid) for carver in carvers]
+    least = np.maximum.reduce([low for low, _ in bounds])
+    far = least >= LIMIT_VOXELS
+    np.clip(least, -LIMIT_VOXELS, None, out=least)
+    return far, [~far & (high > least) for _, high in bounds]
 
 
 def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None = None) -> np.ndarray:
@@ -99,24 +96,53 @@ class _Carver:
         else:
             self._evidence = self._occlusion.evidence(distance(view, self._occlusion.window))
 
-    def carve(self, phi: np.ndarray, grid: Grid) -> None:
-        """phi = max(phi, that), in place, in voxels of `grid`."""
+    def carve(self, phi: np.ndarray, grid: Grid, blocks: np.ndarray | None = None) -> None:
+        """phi = max(phi, that), in place, in voxels of `grid`, in `blocks` (see `carve_view`)."""
         if self._occlusion is None:
-            self._carve_seen(phi, grid, LIMIT_VOXELS)
+            self._carve_seen(phi, grid, LIMIT_VOXELS, blocks)
         else:
-            self._occlusion.carve(phi, grid, self._evidence)
+            self._occlusion.carve(phi, grid, self._evidence, blocks=blocks)
 
-    def carve_least(self, phi: np.ndarray, grid: Grid) -> None:
-        """As `carve`, with the least that is said at any place no deeper than a node."""
-        if self._occlusion is None:
-            self._carve_seen(phi, grid, _FARTHEST)
-        else:
-            self._occlusion.carve_least(phi, grid, self._evidence, _FARTHEST)
+    def bounds(self, middles: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the most that it says at any node of each block of `grid`, by the `middles` of blocks: float32
+        in voxels of `grid`, and right as far as LIMIT_VOXELS from the outline."""
+        margin = self._margin(grid)
+        if margin is None:
+            return np.full(middles.shape, -np.inf, np.float32), np.full(middles.shape, np.inf, np.float32)
+        limit = (LIMIT_VOXELS + margin) / BLOCK + 1
+        low = np.full(middles.shape, -limit, dtype=np.float32)
+        occlusion, reach = self._occlusion, _HALF * grid.voxel
+        if occlusion is None:
+            self._carve_seen(low, middles, limit)
+            low *= BLOCK
+            return low - margin, low + margin
+        high = low.copy()
+        occlusion.carve_least(low, middles, self._evidence, limit, reach)
+        occlusion.carve_most(high, middles, self._evidence, limit, reach, grid.voxel)
+        # Where liquid meets what is hidden, distances jump from those to one outline to those to another.
+        return low * BLOCK - margin, np.maximum(high, 0) * BLOCK + margin
 
-    def _carve_seen(self, phi: np.ndarray, grid: Grid, limit: float) -> None:
+    def _margin(self, grid: Grid) -> float | None:
+        """By how many voxels at most a distance of up to LIMIT_VOXELS at a node of `grid` differs from that at the
+        middle of its block; None where part of the grid is beside the camera or behind it."""
+        camera, focal = self._camera, focal_length(self._camera)
+        last = np.array(grid.shape) - 1
+        corners = grid.to_scene(np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * last)
+        seen = corners @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
+        nearest, farthest = float(seen[:, 2].min()), float(seen[:, 2].max())
+        if nearest <= LIMIT_VOXELS * grid.voxel:
+            return None
+        # Distances grow by one voxel a voxel across the line of sight, by more where a camera sees at a slant, and
+        # along it as pixels widen.
+        slant = float((np.linalg.norm(seen, axis=1) / seen[:, 2]).max())
+        uneven = max(float(camera.K[0, 0]), float(camera.K[1, 1])) / focal
+        slope = uneven * slant + 1.5 * LIMIT_VOXELS * grid.voxel / nearest
+        return slope * _HALF + _BETWEEN_PIXELS * farthest / (focal * grid.voxel)
+
+    def _carve_seen(self, phi: np.ndarray, grid: Grid, limit: float, blocks: np.ndarray | None = None) -> None:
         camera = self._camera
         place = (grid.origin, grid.voxel, camera.projection, focal_length(camera))
-        carve_view(phi, *place, self._evidence, self._corner, limit)
+        carve_view(phi, *place, self._evidence, self._corner, limit, blocks)
 
 
 def _inside(phi: np.ndarray, grid: Grid, tolerance: float) -> Bounds | None:

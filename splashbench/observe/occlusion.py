@@ -148,16 +148,31 @@ class ViewOcclusion:
             layers[layer] = np.where(either & ~outlined, -inner_distance(either), joined)
         return layers
 
-    def carve(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, second: np.ndarray | None = None) -> None:
+    def carve(
+        self,
+        phi: np.ndarray,
+        grid: Grid,
+        layers: np.ndarray,
+        second: np.ndarray | None = None,
+        blocks: np.ndarray | None = None,
+    ) -> None:
         """phi = max(phi, what `layers` say), in place, in voxels of `grid`; see `carve_hidden_view`."""
         tolerance = _TOLERANCE_VOXELS * grid.voxel
-        self._carve(phi, grid, layers, self.nearest, self.starts, tolerance, LIMIT_VOXELS, second)
+        self._carve(phi, grid, layers, self.nearest, self.starts, tolerance, LIMIT_VOXELS, second, blocks)
 
-    def carve_least(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, limit: float) -> None:
-        """As `carve`, with the least that `layers` say at any place no deeper than a node. limit: in voxels."""
+    def carve_least(self, phi: np.ndarray, grid: Grid, layers: np.ndarray, limit: float, reach: float) -> None:
+        """As `carve`, with the least that `layers` say no more than `reach` (scene units) deeper than a node. limit: in
+        voxels."""
         # A point that is hidden at its own depth looks one layer deeper, and no point looks farther.
         starts = np.append(-np.inf, self.starts[:-1]) if len(self.starts) else self.starts
-        self._carve(phi, grid, layers, np.full_like(self.nearest, np.inf), starts, 0.0, limit)
+        self._carve(phi, grid, layers, np.full_like(self.nearest, np.inf), starts, -reach, limit)
+
+    def carve_most(
+        self, phi: np.ndarray, grid: Grid, layers: np.ndarray, limit: float, reach: float, voxel: float
+    ) -> None:
+        """As `carve` on a grid of `voxel`, with the most that `layers` say no more than `reach` nearer than a node."""
+        tolerance = _TOLERANCE_VOXELS * voxel + reach
+        self._carve(phi, grid, layers, np.full_like(self.nearest, np.inf), self.starts, tolerance, limit)
 
     def _carve(
         self,
@@ -169,10 +184,11 @@ class ViewOcclusion:
         tolerance: float,
         limit: float,
         second: np.ndarray | None = None,
+        blocks: np.ndarray | None = None,
     ) -> None:
         camera, corner = self.camera, self.window.corner
         place = (grid.origin, grid.voxel, camera.projection, focal_length(camera))
-        carve_hidden_view(phi, *place, layers, corner, nearest, starts, tolerance, limit, second)
+        carve_hidden_view(phi, *place, layers, corner, nearest, starts, tolerance, limit, second, blocks)
 
 
 class CarvingOcclusion:

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.report.groups import Entry, Group
-from splashbench.report.statistics import (
+from splashbench.score.metrics import METRICS
+from splashbench.score.result import Result
+from splashbench.statistics import (
     Comparison,
     Estimate,
     Trajectory,
@@ -24,8 +26,6 @@ from splashbench.report.statistics import (
     expected_running_time,
     hypervolume,
 )
-from splashbench.score.metrics import METRICS
-from splashbench.score.result import Result
 
 #: The metrics that charts of quality offer, the first one at first.
 QUALITY = ("psnr", "lpips", "miou")

@@ -14,8 +14,8 @@ import numpy as np
 
 from splashbench.report.groups import Group, groups
 from splashbench.report.results import ResultFile
-from splashbench.report.statistics import Estimate, estimate
 from splashbench.score.result import Result
+from splashbench.statistics import Estimate, estimate
 
 
 @dataclass(frozen=True)

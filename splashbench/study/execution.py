@@ -63,7 +63,7 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
     Raises SplashbenchError where `out` holds other files, where another study runs in it, and for a full disk.
     """
     store = Store(out)
-    with _claimed(store):
+    with claimed(store):
         selected = [run for run in plan.runs if options.only is None or run.variant.name in options.only]
         with_lpips = "lpips" in plan.spec.metrics and load_lpips(options.lpips_weights)[0] is not None
         missing = {run.digest: run for run in selected if _is_missing(run, store, with_lpips, options.retry)}
@@ -223,8 +223,11 @@ class _Worker:
 
 
 @contextmanager
-def _claimed(store: Store) -> Iterator[None]:
-    """Hold the study's folder for this process, and remove what a killed one left half-made."""
+def claimed(store: Store) -> Iterator[None]:
+    """Hold the study's folder for this process, and remove what a killed one left half-made.
+
+    Raises SplashbenchError where it holds other files, or another study runs in it.
+    """
     out = store.out
     require_folder_place(out)
     if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():

@@ -1,4 +1,4 @@
-"""The scene of a run: the scene itself, or a copy with worse training masks or fewer training views.
+"""The scene of a run: the scene itself, or a copy with worse training views or fewer of them.
 
 A copy shares all unchanged files with its scene, by hard links where the disk allows them. Test views never change.
 """
@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ from filelock import FileLock
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
-from splashbench.scene import Scene, SceneMeta, write_scene
+from splashbench.scene import Camera, Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
 from splashbench.scene.layout import plain_name
 from splashbench.scene.source import ReleasedSource
-from splashbench.study.perturbation import Perturbation, direction_of_loss, without_part
+from splashbench.study.perturbations import Dice, Perturbation, Recording, perturbed
 from splashbench.study.spec import StudyVariant
+from splashbench.study.thinning import between
 from splashbench.study.view_subsets import nested_views
 
 #: Raised when a change alters the copies that the same description gives.
@@ -68,7 +70,7 @@ def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -
             with atomic_directory(place) as staging:
                 _copy(scene, changed.get("train_views", list(scene.train)), staging)
                 if variant.perturbation:
-                    _perturb_masks(Scene.open(staging), scene, variant.perturbation, seed)
+                    _perturb(Scene.open(staging), scene, variant.perturbation, seed)
     return Scene.open(place)
 
 
@@ -134,16 +136,62 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _perturb_masks(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], seed: int) -> None:
-    """Replace the training masks of `copy` by worse ones; the same seed gives the same masks."""
-    wet = np.array([[scene.mask(name, t).any() for t in range(scene.n_frames)] for name in copy.train])
-    rng = np.random.default_rng([seed, *hashlib.sha256(scene.name.encode()).digest()[:8]])
-    shares = np.ones(wet.shape)
-    for step in steps:
-        shares *= step.draw()(wet, rng)
-    for c, name in enumerate(copy.train):
-        direction = direction_of_loss(rng)
+def _perturb(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], seed: int) -> None:
+    """Replace what the training views of `copy` are told and shown by something worse; the same for the same seed."""
+    recording = recording_of(scene, copy.train)
+    worse = perturbed(recording, steps, Dice(seed, scene.name))
+    if worse.cameras is not recording.cameras:
+        _write_cameras(copy, worse.cameras)
+    paths: dict[tuple[str, int], str] = {}
+    for name in copy.train:
         for t in range(scene.n_frames):
-            if shares[c, t] < 1:
-                part = without_part(scene.mask(name, t), shares[c, t], direction)
-                write_png(copy.mask_path(name, t), np.where(part, 255, 0).astype(np.uint8))
+            image, mask = worse.image(name, t), worse.mask(name, t)
+            if not np.array_equal(mask, scene.mask(name, t)):
+                write_png(copy.mask_path(name, t), np.where(mask, 255, 0).astype(np.uint8))
+            if not np.array_equal(image, scene.image(name, t)):
+                # Losslessly, whatever the original was.
+                path = copy.image_path(name, t)
+                path.unlink()
+                write_png(path.with_suffix(".png"), image)
+                paths[name, t] = f"{name}/{path.with_suffix('.png').name}"
+        container, as_it_was = worse.container_mask(name), scene.container_mask(name)
+        if container is not None and as_it_was is not None and not np.array_equal(container, as_it_was):
+            path = copy.directory / "container_mask" / f"{name}.png"
+            path.unlink()
+            write_png(path, np.where(container, 255, 0).astype(np.uint8))
+    if paths:
+        _rename(copy, paths)
+
+
+def recording_of(scene: Scene, views: Sequence[str] | None = None) -> Recording:
+    """The `views` of `scene` (all training views by default), with what was recorded between its timesteps."""
+    known = between(scene)
+    whole, every = (scene, 1) if known is None else (Scene.open(Path(known.scene)), known.every)
+
+    def frame(t: float) -> int:
+        return min(round(t * every), whole.n_frames - 1)
+
+    return Recording(
+        {name: scene.cameras[name] for name in (scene.train if views is None else views)},
+        scene.n_frames,
+        float(np.median(np.diff(scene.times))) if scene.n_frames > 1 else 1.0,
+        image=lambda name, t: whole.image(name, frame(t)),
+        mask=lambda name, t: whole.mask(name, frame(t)),
+        finest=1 / every,
+        metres_per_unit=None if scene.meta is None else scene.meta.metres_per_unit,
+        container_mask=scene.container_mask,
+    )
+
+
+def _write_cameras(copy: Scene, cameras: Mapping[str, Camera]) -> None:
+    meta = read_json(copy.directory / "train_meta.json")
+    for key, of in (("k", "K"), ("w2c", "w2c")):
+        meta[key] = [[getattr(cameras[name], of).tolist() for name in copy.train]] * copy.n_frames
+    write_json(copy.directory / "train_meta.json", meta)
+
+
+def _rename(copy: Scene, paths: Mapping[tuple[str, int], str]) -> None:
+    meta = read_json(copy.directory / "train_meta.json")
+    for (name, t), path in paths.items():
+        meta["fn"][t][copy.train.index(name)] = path
+    write_json(copy.directory / "train_meta.json", meta)

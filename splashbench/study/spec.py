@@ -17,7 +17,7 @@ from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import validate_model
 from splashbench.score.metrics import METRICS, Metric
-from splashbench.study.perturbation import Perturbation
+from splashbench.study.perturbations import Perturbation
 from splashbench.submission import RENAMED_FIGURES
 from splashbench.submission.withheld import Withheld
 

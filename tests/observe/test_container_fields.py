@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -19,7 +20,7 @@ from splashbench.observe import (
     signed_distance_fields,
 )
 from splashbench.observe.container import depth_image, hidden, hidden_share, solid_distance
-from splashbench.observe.kernels import fill_blocks
+from splashbench.observe.kernels import carve_view, fill_blocks
 from splashbench.observe.occlusion import CarvingOcclusion
 from splashbench.scene import Camera, ContainerMesh, look_at
 
@@ -261,7 +262,7 @@ def test_carving_around_a_container_does_not_depend_on_threads(wall: ContainerOc
 
 
 @pytest.mark.parametrize("occluded", [False, True])
-def test_blocks_that_are_far_outside_are_told_from_their_corners(
+def test_blocks_that_are_far_outside_are_told_from_their_middles(
     wall: ContainerOcclusion, monkeypatch: pytest.MonkeyPatch, occluded: bool
 ) -> None:
     # Small beside its grid, which is not of whole blocks, and with a wall thinner than one.
@@ -275,6 +276,51 @@ def test_blocks_that_are_far_outside_are_told_from_their_corners(
     monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1000)
     np.testing.assert_array_equal(hull.carve_frame(silhouettes, grid, 0, carving), by_blocks)
     assert len(filled) == 1
+
+
+class AnyMasks:
+    """Cameras around the origin, near and far, wide and narrow, with blots for masks."""
+
+    name = "any_masks"
+    n_frames = 1
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.cameras, self._masks = {}, {}
+        for name in "abcd":
+            eye = rng.normal(size=3)
+            eye *= rng.uniform(1.3, 4.0) / np.linalg.norm(eye)
+            focal = rng.uniform(60, 400)
+            intrinsics = np.array([[focal, 0, rng.uniform(20, 140)], [0, focal * rng.uniform(0.7, 1.4), 60], [0, 0, 1]])
+            self.cameras[name] = Camera(name, 160, 120, intrinsics, look_at(eye))
+            blots = cv2.GaussianBlur(rng.normal(size=(120, 160)), (0, 0), rng.uniform(2, 12))
+            self._masks[name] = blots > np.quantile(blots, rng.uniform(0.1, 0.8))
+        self.train = tuple(self.cameras)
+
+    def mask(self, camera: str, t: int) -> np.ndarray:
+        return self._masks[camera]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_blocks_change_nothing_whatever_masks_and_cameras_are(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(seed)
+    silhouettes = Silhouettes(AnyMasks(rng))
+    low = rng.uniform(-1.0, -0.4, 3)
+    grid = Grid.over(Bounds(low, low + rng.uniform(0.9, 1.4, 3)), int(rng.integers(70, 120)))
+    corners = np.sort(rng.uniform(-0.9, 0.9, (2, 3)), axis=0)
+    carving = CarvingOcclusion(ContainerOcclusion(box(*map(tuple, corners))), silhouettes, grid) if seed % 3 else None
+    monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1)
+    by_blocks = hull.carve_frame(silhouettes, grid, 0, carving)
+    monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1000)
+    np.testing.assert_array_equal(hull.carve_frame(silhouettes, grid, 0, carving), by_blocks)
+
+
+def test_points_in_the_plane_of_a_camera_and_behind_it_are_outside() -> None:
+    camera = Camera("a", 20, 20, np.array([[100.0, 0, 10], [0, 100, 10], [0, 0, 1]]), np.eye(4))
+    phi = np.full((21, 21, 21), -20, np.float32)
+    liquid = np.full((20, 20), -3, np.float32)
+    carve_view(phi, np.array([-1.0, -1.0, -1.0]), 0.1, camera.projection, 100.0, liquid, np.zeros(2), 20.0)
+    np.testing.assert_array_equal(phi[:, :, :11], 20)
+    assert phi[10, 10, 12] == pytest.approx(-3 * 0.2 / (100 * 0.1))
 
 
 def test_a_container_out_of_sight_changes_nothing() -> None:

