@@ -64,15 +64,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         metavar="SCENE",
         help="folders of scenes, in place of the spec's",
     )
-    parser.add_argument(
-        "--seeds",
-        nargs="+",
-        action="extend",
-        type=whole_number(0),
-        default=[],
-        metavar="SEED",
-        help="seeds, in place of the spec's",
-    )
+    _add_seeds(parser, "seeds, in place of the spec's")
     add_settings(parser, "a setting of every row, such as the number of iterations; overrides the spec's", dest="base")
     parser.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
     parser.add_argument(
@@ -83,6 +75,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     add_lpips_weights(parser)
 
     _register_stress(actions)
+
+
+def _add_seeds(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument(
+        "--seeds", nargs="+", action="extend", type=whole_number(0), default=[], metavar="SEED", help=text
+    )
 
 
 def _register_stress(actions: argparse._SubParsersAction) -> None:
@@ -126,15 +124,7 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
         metavar="1-5",
         help="which of the five (default: all)",
     )
-    parser.add_argument(
-        "--seeds",
-        nargs="+",
-        action="extend",
-        type=whole_number(0),
-        default=[],
-        metavar="SEED",
-        help="of methods and of what is drawn (default: 0)",
-    )
+    _add_seeds(parser, "of methods and of what is drawn (default: 0)")
     parser.add_argument(
         "--every",
         type=whole_number(1),

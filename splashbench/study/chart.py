@@ -18,6 +18,7 @@ from splashbench.study.table import Table, TableRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito: blue for rows, vermilion for the baseline, grey for controls.
 _BLUE, _VERMILION, _GREY = "#0072B2", "#D55E00", "#666666"
@@ -65,10 +66,15 @@ def draw_chart(table: Table, out: Path) -> list[Path]:
         if table.filtered:
             legend += "\n" + textwrap.fill(FILTER_NOTE, 190)
         figure.supxlabel(legend, x=0.01, ha="left", fontsize=7.5, color=_GREY)
-        paths = [Path(out, "chart.png"), Path(out, "chart.svg")]
-        for path, metadata in zip(paths, ({"Software": None}, {"Date": None, "Creator": None})):
-            with atomic_path(path) as temporary:
-                figure.savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata, facecolor="white")
+        return save_figure(figure, out, "chart")
+
+
+def save_figure(figure: Figure, out: Path, name: str) -> list[Path]:
+    """Write NAME.png and NAME.svg into the folder `out`, without a date, and return their paths."""
+    paths = [Path(out, f"{name}.png"), Path(out, f"{name}.svg")]
+    for path, metadata in zip(paths, ({"Software": None}, {"Date": None, "Creator": None})):
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata, facecolor="white")
     return paths
 
 

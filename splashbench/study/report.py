@@ -37,15 +37,16 @@ def table_csv(table: Table) -> str:
         ]
     )
     mixed = {row.name: str(row.mixed).lower() for row in table.rows}
-    return _csv(counts.join(table.figures, on="variant").assign(mixed=counts["variant"].map(mixed)))
+    return frame_csv(counts.join(table.figures, on="variant").assign(mixed=counts["variant"].map(mixed)))
 
 
 def runs_csv(table: Table) -> str:
     """A row per run; see `Table.run_frame`."""
-    return _csv(table.run_frame)
+    return frame_csv(table.run_frame)
 
 
-def _csv(frame: pd.DataFrame) -> str:
+def frame_csv(frame: pd.DataFrame) -> str:
+    """`frame` as CSV, nine digits of each number."""
     return str(frame.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 

@@ -24,7 +24,7 @@ from splashbench.scene.layout import plain_name
 from splashbench.scene.source import ReleasedSource
 from splashbench.study.perturbations import Dice, Perturbation, Recording, perturbed
 from splashbench.study.spec import StudyVariant
-from splashbench.study.thinning import between
+from splashbench.study.thinning import recorded
 from splashbench.study.view_subsets import nested_views
 
 #: Raised when a change alters the copies that the same description gives.
@@ -145,9 +145,14 @@ def _perturb(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], seed: i
     paths: dict[tuple[str, int], str] = {}
     for name in copy.train:
         for t in range(scene.n_frames):
-            image, mask = worse.image(name, t), worse.mask(name, t)
-            if not np.array_equal(mask, scene.mask(name, t)):
-                write_png(copy.mask_path(name, t), np.where(mask, 255, 0).astype(np.uint8))
+            # Nothing is decoded that no step changes.
+            if worse.mask is not recording.mask:
+                mask = worse.mask(name, t)
+                if not np.array_equal(mask, scene.mask(name, t)):
+                    write_png(copy.mask_path(name, t), np.where(mask, 255, 0).astype(np.uint8))
+            if worse.image is recording.image:
+                continue
+            image = worse.image(name, t)
             if not np.array_equal(image, scene.image(name, t)):
                 # Losslessly, whatever the original was.
                 path = copy.image_path(name, t)
@@ -165,8 +170,7 @@ def _perturb(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], seed: i
 
 def recording_of(scene: Scene, views: Sequence[str] | None = None) -> Recording:
     """The `views` of `scene` (all training views by default), with what was recorded between its timesteps."""
-    known = between(scene)
-    whole, every = (scene, 1) if known is None else (Scene.open(Path(known.scene)), known.every)
+    whole, every = recorded(scene)
 
     def frame(t: float) -> int:
         return min(round(t * every), whole.n_frames - 1)

@@ -1,4 +1,4 @@
-"""Stability: what a method keeps of its quality where the recording is worse (docs/protocol.md, "Stability").
+"""Stability: what a method keeps of its quality where the recording is worse (docs/study.md).
 
 A run's retention is its gain over the control `nothing` as a share of the gain of the same method, scene and seed on
 the recording as it is, between 0 and 1. A run that failed keeps nothing, and neither does a method that gains nothing

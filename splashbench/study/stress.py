@@ -5,16 +5,16 @@ Its runs are those of an ordinary study: kept, resumed and scored alike. What th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from splashbench.errors import SplashbenchError
 from splashbench.harness.discovery import load_method
 from splashbench.scene import Scene
 from splashbench.study.job import Store
-from splashbench.study.perturbations import KINDS, Dice, Step, perturbed
+from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
 from splashbench.study.plan import StudyPlan, make_plan
 from splashbench.study.scenes import recording_of
 from splashbench.study.spec import SceneEntry, StudySpec, StudyVariant, metric_of
@@ -26,6 +26,8 @@ NOTHING = "nothing"
 #: What stability is told by, the first one first; all of them are tabulated.
 METRICS = ("miou", "psnr", "lpips")
 _AS_RECORDED = "as_recorded"
+# Of a method's label in the name of a variant, which has room for a kind and a level besides.
+_LONGEST_LABEL = 32
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,13 @@ class Harm:
 
 @dataclass(frozen=True)
 class StressPlan:
-    """plan: the runs. methods: labels, in order. harms: what is done to recordings. left_out: harms that some scene
-    cannot have, each with the reason."""
+    """plan: the runs. methods: labels, in order. rows: by name of a variant, its method's label and its harm, which is
+    None on the recording as it is. harms: what is done to recordings. left_out: harms that some scene cannot have, each
+    with the reason."""
 
     plan: StudyPlan
     methods: tuple[str, ...]
+    rows: Mapping[str, tuple[str, Harm | None]]
     harms: tuple[Harm, ...]
     left_out: tuple[tuple[Harm, str], ...]
 
@@ -85,17 +89,25 @@ def make_stress_plan(
     labels = _labels(chosen)
     wanted = [Harm(kind, level) for kind in kinds_named(kinds) for level in sorted(set(levels))]
     opened = [thin(scene) for scene in [Scene.open(Path(entry)) for entry in scenes]]
-    left_out = [(harm, reason) for harm in wanted if (reason := _impossible(opened, harm)) is not None]
+    recordings = {scene.name: recording_of(scene) for scene in opened}
+    left_out = [(harm, reason) for harm in wanted if (reason := _impossible(recordings, harm)) is not None]
     harms = [harm for harm in wanted if harm not in [other for other, _ in left_out]]
     if not harms:
         raise SplashbenchError(f"none of the harms is left: {left_out[0][1] if left_out else 'give some severities'}")
-    variants = [StudyVariant(name=f"{NOTHING}.{_AS_RECORDED}", method=NOTHING)]
-    for label, (method, preset) in zip(labels, chosen):
-        row: dict[str, Any] = {"method": method, "preset": preset}
-        variants.append(StudyVariant(name=f"{label}.{_AS_RECORDED}", **row))
-        for harm in harms:
-            name = f"{label}.{harm.kind.named()}.{harm.level}"
-            variants.append(StudyVariant.model_validate({"name": name, "perturbation": [harm.step], **row}))
+    nothing = StudyVariant(name=f"{NOTHING}.{_AS_RECORDED}", method=NOTHING)
+    variants = [nothing]
+    rows: dict[str, tuple[str, Harm | None]] = {nothing.name: (NOTHING, None)}
+    for number, (label, (method, preset)) in enumerate(zip(labels, chosen)):
+        # Methods may be called as they like, variants may not.
+        plain = re.sub(r"[^A-Za-z0-9_-]", "_", label)
+        plain = plain if plain == label and len(plain) <= _LONGEST_LABEL else f"{plain[: _LONGEST_LABEL - 3]}+{number}"
+        for harm in (None, *harms):
+            name = f"{plain}.{_AS_RECORDED if harm is None else f'{harm.kind.named()}.{harm.level}'}"
+            steps = [] if harm is None else [harm.step]
+            rows[name] = label, harm
+            variants.append(
+                StudyVariant.model_validate({"name": name, "method": method, "preset": preset, "perturbation": steps})
+            )
     spec = StudySpec(
         name="stress",
         title="Stability",
@@ -103,12 +115,12 @@ def make_stress_plan(
         scenes=tuple(SceneEntry(path=str(scene.directory)) for scene in opened),
         seeds=tuple(seeds),
         metrics=METRICS,
-        baseline=f"{labels[0]}.{_AS_RECORDED}",
+        baseline=variants[1].name,
         variants=tuple(variants),
         reference=None,
         timeout_seconds=timeout_seconds,
     )
-    return StressPlan(make_plan(spec), tuple(labels), tuple(harms), tuple(left_out))
+    return StressPlan(make_plan(spec), tuple(labels), rows, tuple(harms), tuple(left_out))
 
 
 def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[StressRun], dict[tuple[str, int], float]]:
@@ -123,8 +135,7 @@ def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[Str
         if entry is None:
             continue
         run = StudyRun(planned, entry, store.result(entry))
-        label, _, rest = planned.variant.name.partition(".")
-        kind, _, level = rest.partition(".")
+        label, harm = stress.rows[planned.variant.name]
         value = run.value(metric)
         if label == NOTHING:
             if value is None:
@@ -134,7 +145,8 @@ def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[Str
                 )
             nothing[planned.scene.name, planned.seed] = value
         else:
-            found.append(StressRun(label, planned.scene.name, planned.seed, kind, int(level or 0), value))
+            kind, level = ("", 0) if harm is None else (harm.kind.named(), harm.level)
+            found.append(StressRun(label, planned.scene.name, planned.seed, kind, level, value))
     whole = {(run.method, run.scene, run.seed) for run in found if run.level == 0}
     complete = [run for run in found if (run.method, run.scene, run.seed) in whole and (run.scene, run.seed) in nothing]
     return complete, nothing
@@ -169,11 +181,11 @@ def _labels(chosen: Sequence[tuple[str, str | None]]) -> list[str]:
     return labels
 
 
-def _impossible(scenes: Sequence[Scene], harm: Harm) -> str | None:
-    """Why a scene cannot have `harm`; None where all can."""
-    for scene in scenes:
+def _impossible(recordings: Mapping[str, Recording], harm: Harm) -> str | None:
+    """Why one of `recordings` cannot have `harm`; None where all can."""
+    for name, recording in recordings.items():
         try:
-            perturbed(recording_of(scene), [harm.step], Dice(0, scene.name))
+            perturbed(recording, [harm.step], Dice(0, name))
         except SplashbenchError as error:
-            return f"{scene.name}: {error}"
+            return f"{name}: {error}"
     return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from splashbench.files import atomic_path, files_together, write_text
+from splashbench.files import files_together, write_text
+from splashbench.markdown import bullets, one_line
 from splashbench.markdown import table as markdown_table
+from splashbench.score import Result
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE
 from splashbench.statistics import Estimate
+from splashbench.study.chart import save_figure
 from splashbench.study.job import Store
+from splashbench.study.report import frame_csv
+from splashbench.study.spec import metric_of
 from splashbench.study.stability import (
     BROKEN,
     Breakdown,
@@ -24,6 +30,7 @@ from splashbench.study.stability import (
     stability,
 )
 from splashbench.study.stress import METRICS, Harm, StressPlan, higher_is_better, stress_runs
+from splashbench.study.table_markdown import scenes_and_machines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,12 +42,20 @@ _COLUMNS = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """By one metric: each method's retentions, stability, and breakdown by kind; methods without a run are left out."""
+    """By one metric: each method's retentions, stability, and breakdown by kind; methods without a run are left out.
+
+    filtered: methods whose figures rest on the protocol's filter of mixed methods.
+    """
 
     metric: str
+    filtered: frozenset[str]
     retentions: dict[str, dict[StressRun, float]]
     stability: dict[str, Stability]
     breakdowns: dict[tuple[str, str], Breakdown]
+
+    def marked(self, label: str) -> str:
+        """A method's `label`, with the mark where its figures rest on the filter."""
+        return label + (FILTER_MARK if label in self.filtered else "")
 
 
 def find(stress: StressPlan, store: Store, metric: str) -> Finding:
@@ -61,16 +76,19 @@ def find(stress: StressPlan, store: Store, metric: str) -> Finding:
             }
             if {run.level for run in ranked} == set(range(1, len(levels) + 1)):
                 points[label, kind] = breakdown(ranked, kind, amounts)
-    return Finding(metric, by_method, {label: stability(found) for label, found in by_method.items()}, points)
+    results = _results(stress, store)
+    mixed = {label for label, result in results if result.mixed} if metric_of(metric).filtered else set()
+    scores = {label: stability(found) for label, found in by_method.items()}
+    return Finding(metric, frozenset(mixed), by_method, scores, points)
 
 
 def write_stress_report(stress: StressPlan, store: Store, out: Path, command: str) -> list[Path]:
     """Write all files into `out`, all or none; returns their paths."""
     findings = [find(stress, store, metric) for metric in METRICS if _has(stress, store, metric)]
     with files_together(out) as staging:
-        write_text(staging / "stability.csv", _csv(_stability_frame(findings)))
-        write_text(staging / "breakdown.csv", _csv(_breakdown_frame(stress, findings)))
-        write_text(staging / "retention.csv", _csv(_retention_frame(stress, findings)))
+        write_text(staging / "stability.csv", frame_csv(_stability_frame(findings)))
+        write_text(staging / "breakdown.csv", frame_csv(_breakdown_frame(stress, findings)))
+        write_text(staging / "retention.csv", frame_csv(_retention_frame(stress, findings)))
         names = ["stability.md", "stability.csv", "breakdown.csv", "retention.csv"]
         if findings and findings[0].breakdowns:
             names += [path.name for path in _draw(stress, findings[0], staging)]
@@ -80,8 +98,25 @@ def write_stress_report(stress: StressPlan, store: Store, out: Path, command: st
 
 def _has(stress: StressPlan, store: Store, metric: str) -> bool:
     """Whether any run has `metric`: LPIPS needs weights."""
-    results = (store.result(entry) for run in stress.plan.runs if (entry := store.entry(run.digest)))
-    return any(result is not None and result.value(metric) is not None for result in results)
+    return any(result.value(metric) is not None for _, result in _results(stress, store))
+
+
+def _results(stress: StressPlan, store: Store) -> list[tuple[str, Result]]:
+    """The results that are there, each with its method's label."""
+    entries = ((stress.rows[run.variant.name][0], store.entry(run.digest)) for run in stress.plan.runs)
+    found = ((label, store.result(entry)) for label, entry in entries if entry is not None)
+    return [(label, result) for label, result in found if result is not None]
+
+
+def _conditions(stress: StressPlan, store: Store) -> str:
+    """What was run, what the scenes told, where."""
+    results = _results(stress, store)
+    methods = dict.fromkeys(f"{label}: version {r.method_version}, preset {r.preset}" for label, r in results)
+    told = dict.fromkeys(", ".join(r.told) or "nothing" for _, r in results if r.told is not None)
+    lines = [*methods, *(f"Told besides images, masks and cameras: {text}" for text in told)]
+    lines.append(f"Seeds: {', '.join(map(str, stress.plan.spec.seeds))}")
+    parts = [bullets(map(one_line, lines)), scenes_and_machines(stress.plan.scenes, [r for _, r in results])]
+    return "\n".join(parts)
 
 
 def _amounts(harms: Sequence[Harm]) -> dict[str, list[float]]:
@@ -90,10 +125,6 @@ def _amounts(harms: Sequence[Harm]) -> dict[str, list[float]]:
     for harm in harms:
         found.setdefault(harm.kind.named(), [harm.kind.none]).append(harm.amount)
     return found
-
-
-def _csv(frame: pd.DataFrame) -> str:
-    return str(frame.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
 
 
 def _stability_frame(findings: Sequence[Finding]) -> pd.DataFrame:
@@ -147,24 +178,23 @@ def _retention_frame(stress: StressPlan, findings: Sequence[Finding]) -> pd.Data
 
 
 def _markdown(stress: StressPlan, store: Store, findings: Sequence[Finding], command: str, with_chart: bool) -> str:
-    parts = ["# Stability", f"`{command}`"]
+    parts = ["# Stability", f"```\n{command}\n```"]
     if with_chart:
         parts.append("![Retention by kind and severity](retention.png)")
     for finding in findings:
         parts += [f"## By {finding.metric}", _scores(finding), _points(stress, finding)]
+        parts += [FILTER_NOTE] if finding.filtered else []
     failures = [
-        f"- {run.scene.name}, {run.variant.name}, seed {run.seed}: {entry.status}: {entry.reason}"
+        one_line(f"{run.scene.name}, {run.variant.name}, seed {run.seed}: {entry.status}: {entry.reason}")
         for run in stress.plan.runs
         if (entry := store.entry(run.digest)) is not None and entry.status != "ok"
     ]
     missing = sum(store.entry(run.digest) is None for run in stress.plan.runs)
     if failures:
-        parts += ["## Failed runs", "Each keeps nothing.", "\n".join(failures)]
+        parts += ["## Failed runs", "Each keeps nothing.", bullets(failures)]
     if stress.left_out:
-        lines = [
-            f"- {harm.kind.named()} {harm.amount:g} {harm.kind.unit}: {reason}" for harm, reason in stress.left_out
-        ]
-        parts += ["## Left out", "\n".join(lines)]
+        lines = [f"{h.kind.named()} {h.amount:g} {h.kind.unit}: {one_line(reason)}" for h, reason in stress.left_out]
+        parts += ["## Left out", bullets(lines)]
     if missing:
         parts.append(f"{missing} runs are not made yet.")
     parts.append(
@@ -172,6 +202,7 @@ def _markdown(stress: StressPlan, store: Store, findings: Sequence[Finding], com
         f"`nothing` as a share of the same method's gain on the recording as it is. It breaks where retention falls "
         f"below {BROKEN:g}. Intervals are 95 %, by resampling scenes and seeds; there is none for fewer than five runs."
     )
+    parts += ["## Conditions", _conditions(stress, store)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -183,7 +214,7 @@ def _scores(finding: Finding) -> str:
         "runs": [str(found.runs) for found in rows.values()],
         "failed": [str(found.failed) for found in rows.values()],
     }
-    return markdown_table({"method": list(rows), **figures}, right=figures)
+    return markdown_table({"method": [finding.marked(label) for label in rows], **figures}, right=figures)
 
 
 def _shown(estimate: Estimate) -> str:
@@ -196,7 +227,7 @@ def _points(stress: StressPlan, finding: Finding) -> str:
     units = {harm.kind.named(): harm.kind.unit for harm in stress.harms}
     kinds = [kind for kind in units if any((label, kind) in finding.breakdowns for label in finding.stability)]
     columns = {
-        f"{label} breaks at": [_place(finding.breakdowns.get((label, kind))) for kind in kinds]
+        f"{finding.marked(label)} breaks at": [_place(finding.breakdowns.get((label, kind))) for kind in kinds]
         for label in finding.stability
     }
     cells = {"kind": [f"`{kind}`" for kind in kinds], "unit": [units[kind] for kind in kinds]}
@@ -234,17 +265,7 @@ def _draw(stress: StressPlan, finding: Finding, out: Path) -> list[Path]:
         figure.suptitle(
             f"What is left of {finding.metric} where the recording is worse", x=0.01, ha="left", fontsize=11
         )
-        paths = [Path(out, "retention.png"), Path(out, "retention.svg")]
-        metadata: Mapping[str, dict[str, None]] = {
-            ".png": {"Software": None},
-            ".svg": {"Date": None, "Creator": None},
-        }
-        for path in paths:
-            with atomic_path(path) as temporary:
-                figure.savefig(
-                    temporary, format=path.suffix[1:], dpi=130, metadata=metadata[path.suffix], facecolor="white"
-                )
-    return paths
+        return save_figure(figure, out, "retention")
 
 
 def _panel(axes: Axes, stress: StressPlan, finding: Finding, kind: str) -> None:

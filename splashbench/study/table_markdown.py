@@ -6,11 +6,13 @@ The paper's figures stand in a table of their own: they are of other scenes and 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from splashbench.markdown import bullets, one_line
 from splashbench.markdown import table as markdown_table
 from splashbench.score.notation import FILTER_NOTE, NO_FIGURE, filter_mark, label, shown, shown_with_spread
+from splashbench.score.result import Result
+from splashbench.study.plan import NamedScene
 from splashbench.study.spec import DERIVED, metric_of
 from splashbench.study.table import NOT_RUN, Table, TableRow
 
@@ -32,7 +34,8 @@ def to_markdown(table: Table, command: str) -> str:
         _grid(table, lambda row, name: _difference(table, row, name), leave_out=spec.baseline),
     ]
     parts += [*_paper(table), "## What the rows change", _variants(table)]
-    parts += [*_failures(table), *_missing(table), "## Scenes and machines", _scenes_and_machines(table)]
+    parts += [*_failures(table), *_missing(table), "## Scenes and machines"]
+    parts.append(scenes_and_machines(table.plan.scenes, [run.result for run in table.runs if run.result]))
     return "\n\n".join(parts) + "\n"
 
 
@@ -181,9 +184,10 @@ def _missing(table: Table) -> list[str]:
     return ["## Why a figure is missing", bullets(lines)] if lines else []
 
 
-def _scenes_and_machines(table: Table) -> str:
+def scenes_and_machines(scenes: Sequence[NamedScene], results: Sequence[Result]) -> str:
+    """A list of `scenes` with their sizes, and of the machines and the software of `results`."""
     lines = []
-    for named in table.plan.scenes:
+    for named in scenes:
         scene = named.scene
         sizes = sorted({f"{camera.width}x{camera.height}" for camera in scene.cameras.values()})
         shown = sizes[0] if len(sizes) == 1 else f"{len(sizes)} sizes from {sizes[0]}"
@@ -191,7 +195,6 @@ def _scenes_and_machines(table: Table) -> str:
             f"{named.name}: {scene.n_frames} frames of {len(scene.train)} training and {len(scene.test)} test views, "
             f"{shown} pixels, digest `{scene.digest[:12]}`"
         )
-    results = [run.result for run in table.runs if run.result]
     lines += [f"Machine: {one_line(text)}" for text in sorted({r.hardware_label for r in results})]
     versions = sorted({", ".join(f"{key} {value}" for key, value in r.versions.items()) for r in results})
     lines += [f"Software: {one_line(text)}" for text in versions]

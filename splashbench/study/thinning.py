@@ -6,6 +6,7 @@ import hashlib
 import json
 from pathlib import Path
 
+import numpy as np
 from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -28,10 +29,26 @@ class Between(BaseModel):
     every: int = Field(ge=2)
 
 
-def between(scene: Scene) -> Between | None:
-    """What was recorded between the timesteps of `scene`; None where nothing is known."""
+def recorded(scene: Scene) -> tuple[Scene, int]:
+    """The scene that has what was recorded between the timesteps of `scene`, and each how many of its timesteps these
+    are: `scene` itself and 1 where nothing is known.
+
+    Raises SplashbenchError where that other scene is gone, or is none that `scene` could be made of.
+    """
     path = scene.directory / _FILE
-    return read_model(path, Between) if path.is_file() else None
+    if not path.is_file():
+        return scene, 1
+    said = read_model(path, Between)
+    whole = Scene.open(Path(said.scene))
+    same_times = np.array_equal(whole.times[:: said.every], scene.times)
+    same_cameras = whole.cameras.keys() >= set(scene.cameras) and all(
+        (camera.width, camera.height) == (whole.cameras[name].width, whole.cameras[name].height)
+        and np.array_equal(camera.projection, whole.cameras[name].projection)
+        for name, camera in scene.cameras.items()
+    )
+    if not (same_times and same_cameras):
+        raise SplashbenchError(f"{path} names {said.scene}, which has other times or cameras; delete the file")
+    return whole, said.every
 
 
 def thinned(scene: Scene, every: int, folder: Path) -> Scene:

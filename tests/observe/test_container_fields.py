@@ -271,7 +271,12 @@ def test_blocks_that_are_far_outside_are_told_from_their_middles(
     carving = CarvingOcclusion(wall, silhouettes, grid) if occluded else None
     filled = []
     monkeypatch.setattr(hull, "fill_blocks", lambda *given: (filled.append(given[1].mean()), fill_blocks(*given)))
+    told, blocks = [], hull._blocks
+    monkeypatch.setattr(hull, "_blocks", lambda *given: (told.append(blocks(*given)), told[-1])[1])
     by_blocks = hull.carve_frame(silhouettes, grid, 0, carving)
+    ((far, wanted),) = told
+    # Of what is not far, no view is asked everywhere, and each somewhere.
+    assert all(0.02 < of_view[~far].mean() < 0.98 for of_view in wanted)
     assert 0.2 < filled[0] < (by_blocks == 20).mean() < 1
     monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1000)
     np.testing.assert_array_equal(hull.carve_frame(silhouettes, grid, 0, carving), by_blocks)

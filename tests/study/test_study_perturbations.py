@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +53,7 @@ from splashbench.study.perturbations.masks import (
     HoledMasks,
     WrongMasks,
 )
-from splashbench.study.scenes import changed_scene
+from splashbench.study.scenes import changed_scene, recording_of
 from splashbench.study.spec import StudyVariant
 from splashbench.study.thinning import thinned
 
@@ -308,6 +309,8 @@ def test_outlines_waver_and_no_more() -> None:
 
 def test_one_camera_has_the_masks_of_something_else() -> None:
     worse = perturbed(recording(), [WrongMasks(amount=0.5)], DICE)
+    least = perturbed(recording(), [WrongMasks(amount=0.01)], DICE)
+    assert sum((least.mask(n, t) != disc(n, t)).any() for n in least.views for t in range(FRAMES)) == 1
     wrong = np.array([[(worse.mask(n, t) != disc(n, t)).any() for t in range(FRAMES)] for n in worse.views])
     assert sorted(wrong.sum(axis=1)) == [0, 0, 0, FRAMES // 2]
     assert np.abs(np.diff(wrong.astype(int), axis=1)).sum() <= 2
@@ -398,6 +401,27 @@ def test_a_thinned_scene_shows_what_was_recorded_between_its_timesteps(balls: Sc
     assert thinned(balls, 2, tmp_path / "thin").directory == thin.directory
     with pytest.raises(SplashbenchError, match="leaves 1"):
         thinned(balls, balls.n_frames, tmp_path / "thin")
+
+
+@pytest.mark.parametrize("every", [2, 1_000_000_000])
+def test_a_scene_that_names_another_as_its_own_recording_is_refused(every: int, balls_copy: Path) -> None:
+    said = {"schema_version": 1, "scene": str(balls_copy), "every": every}
+    (balls_copy / "between.json").write_text(json.dumps(said))
+    with pytest.raises(SplashbenchError, match=r"between\.json names .* other times or cameras; delete the file"):
+        recording_of(Scene.open(balls_copy))
+    (balls_copy / "between.json").write_text(json.dumps(said | {"scene": "/nowhere"}))
+    with pytest.raises(SplashbenchError, match="nowhere"):
+        recording_of(Scene.open(balls_copy))
+
+
+def test_nothing_is_read_before_it_is_asked_for() -> None:
+    def never(name: str, t: float) -> np.ndarray:
+        raise AssertionError("read too early")
+
+    given = replace(recording(), image=never, mask=never)
+    for kind in KINDS:
+        for step in severities(kind):
+            perturbed(given, [step], DICE)
 
 
 @pytest.mark.parametrize(

@@ -42,8 +42,13 @@ def test_the_page_says_where_methods_break_and_which_runs_failed(study: Path) ->
     page = (study / "stability.md").read_text(encoding="utf-8")
     assert "## By miou" in page
     assert "## By psnr" in page
-    assert "cautious.exposure.5, seed 0: crash: RuntimeError: so bright" in page or "so bright" in page
-    assert "clock_offset 8 ms: synthetic_balls" in page or "clock_offset 8 ms" in page
+    assert "cautious.exposure.5, seed 0: crashed: RuntimeError: so bright, and so dark" in page
+    assert "- clock_offset 8 ms: balls: clock_offset 8 ms: frames were recorded 57.5 ms apart" in page
+    # What was run, told and drawn, and where.
+    assert "- grey: version 3, preset best" in page
+    assert "- Told besides images, masks and cameras: " in page
+    assert "- Seeds: 0" in page
+    assert "- Machine: " in page
     assert (study / "retention.png").stat().st_size > 10_000
     points = pd.read_csv(study / "breakdown.csv")
     broken = points[(points.method == "cautious") & (points.metric == "psnr") & (points.kind == "exposure")]
@@ -85,6 +90,19 @@ def test_what_makes_no_sense_is_one_line(
     assert message in told
     assert len(told.splitlines()) == 1
     assert not out.exists()
+
+
+def test_a_method_may_be_called_as_it_likes(balls_directory: Path, tmp_path: Path) -> None:
+    odd = tmp_path / "odd.py"
+    lines = ["import sys", f"sys.path.insert(0, {str(METHODS.parent)!r})", "from study_methods import Grey"]
+    for name, method in (("Dotted", "my.method"), ("Long", "a" * 50), ("Longer", "a" * 60)):
+        lines.append(f"class {name}(Grey):\n    id = {method!r}")
+    odd.write_text("\n".join(lines) + "\n")
+    out, methods = tmp_path / "out", [f"{odd}:{name}" for name in ("Dotted", "Long", "Longer")]
+    command = ["study", "stress", str(out), "--methods", *methods, "--scenes", str(balls_directory)]
+    assert main([*command, "--kinds", "haze", "--severities", "5"]) == 0
+    found = pd.read_csv(out / "retention.csv").query("metric == 'psnr'")
+    assert list(found.method) == ["my.method", "a" * 50, "a" * 60]
 
 
 def test_a_method_may_come_with_two_presets(balls_directory: Path) -> None:

@@ -1,9 +1,9 @@
-"""What can be wrong with a recording, in physical units: masks, photographs, cameras, clocks (docs/protocol.md)."""
+"""What can be wrong with a recording, in physical units: masks, photographs, cameras, clocks (docs/study.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, get_args
 
 from pydantic import Field
 
@@ -32,39 +32,6 @@ from .masks import (
     with_shares,
 )
 from .recording import Dice, Recording, Step
-
-#: All kinds, in the order in which tables have them.
-KINDS: tuple[type[Step], ...] = (
-    EmptyMasks,
-    MissingParts,
-    ErodedMasks,
-    GrownMasks,
-    HoledMasks,
-    FlickeringMasks,
-    WrongMasks,
-    ClockOffset,
-    ClockOffsets,
-    ClockDrift,
-    RollingShutter,
-    DroppedFrames,
-    DoubledFrames,
-    MotionBlur,
-    PoseRotation,
-    PoseTranslation,
-    FocalError,
-    PrincipalPointError,
-    LensDistortion,
-    CameraMoved,
-    Exposure,
-    WhiteBalance,
-    Gamma,
-    SensorNoise,
-    Defocus,
-    Compression,
-    Haze,
-    MovingShadow,
-    Passer,
-)
 
 Perturbation = Annotated[
     EmptyMasks
@@ -98,6 +65,8 @@ Perturbation = Annotated[
     | Passer,
     Field(discriminator="kind"),
 ]
+#: All kinds, in the order in which tables have them.
+KINDS: tuple[type[Step], ...] = get_args(get_args(Perturbation)[0])
 
 
 def perturbed(recording: Recording, steps: Sequence[Step], dice: Dice) -> Recording:

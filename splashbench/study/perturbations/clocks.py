@@ -63,10 +63,7 @@ class ClockOffsets(Step):
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
         apart = _timesteps(self, recording, self.amount)
-        values = dice.of("offsets").normal(size=len(recording.views))
-        values -= values.mean()
-        values /= max(float(np.sqrt((values**2).mean())), 1e-9)
-        return _shifted(recording, dict(zip(recording.views, (apart * values).tolist())))
+        return _shifted(recording, {n: apart * v for n, v in dice.spread(recording.views, "offsets").items()})
 
 
 class ClockDrift(Step):

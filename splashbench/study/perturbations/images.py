@@ -41,14 +41,6 @@ def to_srgb(linear: NDArray[np.floating]) -> _Image:
     return np.rint(255 * curve).astype(np.uint8)
 
 
-def _per_camera(recording: Recording, dice: Dice, what: str) -> dict[str, float]:
-    """A number of each camera with a mean of 0 and a root mean square of 1, the same for all of its frames."""
-    values = dice.of(what).normal(size=len(recording.views))
-    values -= values.mean()
-    values /= max(float(np.sqrt((values**2).mean())), 1e-9)
-    return dict(zip(recording.views, values.tolist()))
-
-
 class Exposure(Step):
     """Cameras expose apart by `amount` stops (root mean square)."""
 
@@ -58,7 +50,7 @@ class Exposure(Step):
     ladder: ClassVar[tuple[float, ...]] = (0.1, 0.25, 0.5, 1.0, 1.5)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
-        stops = _per_camera(recording, dice, "exposure")
+        stops = dice.spread(recording.views, "exposure")
         return recording.with_images(
             lambda name, t, image: to_srgb(to_linear(image) * np.float32(2.0 ** (self.amount * stops[name])))
         )
@@ -73,7 +65,7 @@ class WhiteBalance(Step):
     ladder: ClassVar[tuple[float, ...]] = (0.05, 0.1, 0.2, 0.4, 0.8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
-        warmth = _per_camera(recording, dice, "white balance")
+        warmth = dice.spread(recording.views, "white balance")
 
         def change(name: str, t: float, image: _Image) -> _Image:
             gain = 2.0 ** (self.amount * warmth[name])
@@ -91,7 +83,7 @@ class Gamma(Step):
     ladder: ClassVar[tuple[float, ...]] = (0.05, 0.1, 0.2, 0.4, 0.8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
-        exponents = {n: 2.0 ** (self.amount * v) for n, v in _per_camera(recording, dice, "gamma").items()}
+        exponents = {n: 2.0 ** (self.amount * v) for n, v in dice.spread(recording.views, "gamma").items()}
         values = np.arange(256) / 255
         tables = {name: np.rint(255 * values**power).astype(np.uint8) for name, power in exponents.items()}
         return recording.with_images(lambda name, t, image: tables[name][image])
@@ -171,7 +163,7 @@ class MovingShadow(Step):
 
 
 class Passer(Step):
-    """Someone walks past behind the liquid, `amount` of the image tall, through the views one after the other."""
+    """Someone walks past behind the liquid, `amount` of the image tall, through every view, in some sooner."""
 
     kind: Literal["person_walking_past"] = "person_walking_past"
     amount: float = Field(ge=0, le=1)

@@ -10,6 +10,7 @@ masks. Here frames that are hard in one view tend to be hard in the others and a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import ClassVar, Literal
 
 import cv2
@@ -77,17 +78,21 @@ class MissingParts(MaskShare):
 
 def with_shares(recording: Recording, steps: Sequence[MaskShare], dice: Dice) -> Recording:
     """`recording` with what `steps` leave of its masks; shares of one mask are multiplied."""
-    rng = dice.all()
-    wet = np.array([[recording.mask(name, t).any() for t in range(recording.n_frames)] for name in recording.views])
-    shares = np.ones(wet.shape)
-    for step in steps:
-        shares *= step.draw()(wet, rng)
-    directions = {name: direction_of_loss(rng) for name in recording.views}
-    kept = dict(zip(recording.views, shares))
+
+    @cache
+    def drawn() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Of each view the shares of its masks, and the direction in which they lose."""
+        rng, frames = dice.all(), range(recording.n_frames)
+        wet = np.array([[recording.mask(name, t).any() for t in frames] for name in recording.views])
+        shares = np.ones(wet.shape)
+        for step in steps:
+            shares *= step.draw()(wet, rng)
+        return {name: (of_view, direction_of_loss(rng)) for name, of_view in zip(recording.views, shares)}
 
     def change(name: str, t: float, mask: _Mask) -> _Mask:
-        share = kept[name][min(int(t), recording.n_frames - 1)]
-        return without_part(mask, share, directions[name]) if share < 1 else mask
+        shares, direction = drawn()[name]
+        share = shares[min(int(t), recording.n_frames - 1)]
+        return without_part(mask, share, direction) if share < 1 else mask
 
     return recording.with_masks(change)
 
@@ -165,7 +170,7 @@ class WrongMasks(Step):
     def applied(self, recording: Recording, dice: Dice) -> Recording:
         rng = dice.of("camera")
         chosen = str(rng.choice(recording.views))
-        count = round(self.amount * recording.n_frames)
+        count = max(1, round(self.amount * recording.n_frames)) if self.amount > 0 else 0
         start = int(rng.integers(0, recording.n_frames - count + 1))
 
         def change(name: str, t: float, mask: _Mask) -> _Mask:

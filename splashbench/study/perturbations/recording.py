@@ -1,9 +1,9 @@
-"""What a method sees of the training views, as something that can be made worse (docs/protocol.md, "Stability")."""
+"""What a method sees of the training views, as something that can be made worse (docs/study.md)."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, get_args
 
@@ -83,6 +83,13 @@ class Dice:
         """The generator for `what`: a camera, a frame, a purpose."""
         text = "/".join(map(str, (self.name, *what)))
         return np.random.default_rng([self.seed, *hashlib.sha256(text.encode()).digest()[:8]])
+
+    def spread(self, views: Sequence[str], what: str) -> dict[str, float]:
+        """A number of each of `views` for `what`, with a mean of 0 and a root mean square of 1."""
+        values = self.of(what).normal(size=len(views))
+        values -= values.mean()
+        values /= max(float(np.sqrt((values**2).mean())), 1e-9)
+        return dict(zip(views, values.tolist()))
 
 
 class Step(BaseModel):
