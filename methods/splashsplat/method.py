@@ -18,6 +18,7 @@ from splashbench.scene.camera import Camera
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
+from splashbench.selfcalibration import self_calibration
 
 from .appearance.decoder import Children
 from .appearance.fitting import composite
@@ -173,6 +174,13 @@ class SplashSplat(Method):
                     plates,
                     lambda state, milestone: run.checkpoint(lambda: FittedSplashSplat(*state()), milestone),
                 )
+        if config.self_calibration:
+            with run.stage("self-calibration"):
+                calibration = self_calibration(scene, plates, lambda what: run.progress(0, what))
+            if calibration:
+                run.note("self-calibration", "; ".join(calibration.lines(scene.cameras)))
+                scene, known = calibration.scene(scene), None
+                plates = cache(lambda: clean_plates(scene))
         deferred = config.plates_share > 0 and config.composition != "together"
         behind: dict[str, np.ndarray]
         frozen: dict[str, Frozen] | None = None

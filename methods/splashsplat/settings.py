@@ -37,7 +37,7 @@ _DRAFT_PLATES_SHARE = 0.25
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "13"
+VERSION = "14"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -72,6 +72,8 @@ class SplashSplatConfig(MethodConfig):
     detect_failed_masks: bool = True
     #: replace empty masks where other views see liquid; in the paper they say that there is none
     replace_empty_masks: bool = True
+    #: look for clocks, cameras and exposures that are other than told, in the footage itself, and go by what is found
+    self_calibration: bool = True
     #: carve, and compare photographs, at each camera's own times, where the scene has them
     camera_times: bool = True
     #: level the liquid that rests in the container (needs the mesh and gravity)
@@ -203,6 +205,7 @@ class SplashSplatConfig(MethodConfig):
             "cut_at_rim": False,
             "detect_failed_masks": False,
             "replace_empty_masks": False,
+            "self_calibration": False,
             "camera_times": False,
             "pool": False,
             "ballistic": False,

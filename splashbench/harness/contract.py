@@ -182,6 +182,8 @@ class Run:
             self._digests[scene.directory] = training_digest(scene)
             self._overhead_seconds += time.perf_counter() - start
         key = {**key, "seed": self.seed if seeded else None, "device": self.device}
+        if scene.variation:  # only there: what was stored before must not change its name
+            key["variation"] = scene.variation
         part = reuse(self.cache, name, self._digests[scene.directory], key, fit, save, load)
         self._overhead_seconds += part.overhead_seconds
         if part.loaded_seconds is not None:

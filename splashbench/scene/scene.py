@@ -248,6 +248,8 @@ class TrainingScene:
             scene.is_released,
         )
         self.container_transparent = scene.container_transparent
+        #: how it differs from the scene in its folder; empty where it does not
+        self.variation = ""
 
     def _training_only(self, camera: str) -> None:
         if camera not in self.cameras:

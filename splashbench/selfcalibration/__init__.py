@@ -1,0 +1,7 @@
+"""Self-calibration: clocks, cameras and exposures that are other than a scene says, found in its own footage."""
+
+from __future__ import annotations
+
+from .scene import CalibratedScene, SelfCalibration, self_calibration
+
+__all__ = ["CalibratedScene", "SelfCalibration", "self_calibration"]
