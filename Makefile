@@ -49,7 +49,8 @@ QUICK := $(addprefix tests/test_, alignment.py architecture.py files.py manifest
   harness/test_output_checks.py harness/test_runner_geometry.py harness/test_training_copy.py methods/test_renamed_settings.py \
   methods/test_scaffold_parts.py native/test_native_library.py observe/test_observe_fields.py prepare/test_gates.py \
   prepare/test_session.py render/test_render_parts.py report/test_report_leaderboard.py scene/test_camera.py \
-  score/test_score_neighbours.py score/test_score_notation.py score/test_score_protocol.py study/test_study_table.py \
+  score/test_score_neighbours.py score/test_score_notation.py score/test_score_protocol.py \
+  selfcalibration/test_exposure.py study/test_study_table.py \
   submission/test_submission.py synth/test_synth_audio.py)
 quick-test: .venv/installed-test
 	@echo "==> Running the quick tests"

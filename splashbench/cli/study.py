@@ -101,7 +101,7 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
         nargs="+",
         action="extend",
         required=True,
-        metavar="METHOD[:PRESET]",
+        metavar="METHOD[:PRESET][:KEY=VALUE,...]",
         help="what is run: names of methods, or FILE.py:CLASS; the preset is a method's first by default",
     )
     parser.add_argument(
@@ -141,6 +141,13 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
     )
+    parser.add_argument(
+        "--budget",
+        type=positive_number("minutes"),
+        metavar="MINUTES",
+        help="make runs as long as they end within so many minutes, those first that say the most about where methods "
+        "break; the same command again goes on (default: all runs)",
+    )
     parser.add_argument("--retry", action="store_true", help="repeat failed runs")
     add_lpips_weights(parser)
 
@@ -150,6 +157,7 @@ def stress(arguments: argparse.Namespace) -> int:
     from splashbench.scene import Scene
     from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed
     from splashbench.study.job import Store
+    from splashbench.study.spending import Budget, by_uncertainty
     from splashbench.study.stress import make_stress_plan
     from splashbench.study.stress_report import write_stress_report
     from splashbench.study.thinning import thinned
@@ -178,8 +186,10 @@ def stress(arguments: argparse.Namespace) -> int:
         f"{len(planned.plan.scenes)} scenes, {len(planned.plan.spec.seeds)} seeds"
     )
     options = ExecutionOptions(
-        jobs=arguments.jobs, retry=arguments.retry, lpips_weights=arguments.lpips_weights, tell=say
+        jobs=arguments.jobs, retry=arguments.retry, lpips_weights=arguments.lpips_weights, tell=say, pictures=True
     )
+    if arguments.budget:
+        options.order = by_uncertainty(planned, store, Budget(60 * arguments.budget))
     tally = carry_out_plan(planned.plan, arguments.out, options)
     files = write_stress_report(planned, store, arguments.out, _stress_command(arguments))
     say(f"{tally.made} runs made" + (f", {tally.reused} reused" if tally.reused else ""))
@@ -204,6 +214,7 @@ def _stress_command(arguments: argparse.Namespace) -> str:
         values = getattr(arguments, flag)
         words += [f"--{flag}", *map(str, values)] if values else []
     words += ["--every", str(arguments.every)] if arguments.every > 1 else []
+    words += ["--budget", f"{arguments.budget:g}"] if arguments.budget else []
     return shlex.join(words)
 
 

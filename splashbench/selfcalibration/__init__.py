@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from .scene import CalibratedScene, SelfCalibration, self_calibration
+from .writing import write_calibrated
 
-__all__ = ["CalibratedScene", "SelfCalibration", "self_calibration"]
+__all__ = ["CalibratedScene", "SelfCalibration", "self_calibration", "write_calibrated"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from splashbench.scene import Camera
 from .features import Tracks
 
 # Points below which cameras are left as told: of all, and in each view that is changed.
-_LEAST_POINTS, _LEAST_OF_A_VIEW = 60, 20
+_LEAST_POINTS, _LEAST_OF_A_VIEW = 60, 15
 # Points that have a say, at the most, and others that tell whether they are better explained.
 _MOST_POINTS = 300
 # Reprojection errors beyond this many times their median count for little.
@@ -30,14 +31,15 @@ _OUTLIER = 3.0
 _FINEST = 0.05
 # Changes of a camera below so many pixels cost as their square, above as their size.
 _SMALL = 0.05
-_ROUNDS, _STEPS = 4, 4
+# Rounds of reweighting, evaluations in each, and the step of derivatives in pixels.
+_ROUNDS, _STEPS, _STEP = 4, 8, 1e-4
 # What changes cost, against the points' errors.
-_PRIOR = 0.05
+_PRIOR = 0.1
 # Cameras are right where a typical point is off by less, in pixels of an image of 240; and they are changed only where
 # points that had no say in it are off by this share at most, afterwards.
 _RIGHT, _BETTER = 0.12, 0.7
 # An answer is as good as the best where points are off by no more than this times as much, and this many pixels.
-_AS_GOOD, _AS_GOOD_PIXELS = 1.05, 0.003
+_AS_GOOD, _AS_GOOD_PIXELS = 1.1, 0.006
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,8 @@ class _Problem:
     ) -> Camera:
         pixel = 1 / camera.K[0, 0]
         K = camera.K.copy()
-        K[[0, 1], [0, 1]] *= 1 + focal / (0.5 * max(camera.width, camera.height))
+        # Never below 0, wherever the search goes.
+        K[[0, 1], [0, 1]] *= np.exp(np.clip(focal / (0.5 * max(camera.width, camera.height)), -1, 1))
         K[:2, 2] += point
         w2c = camera.w2c.copy()
         w2c[:3, :3] = Rotation.from_rotvec(turn * pixel).as_matrix() @ camera.w2c[:3, :3]
@@ -182,9 +185,17 @@ def _depths(tracks: Tracks, cameras: Mapping[str, Camera]) -> dict[str, float]:
 
 
 def typical_error(tracks: Tracks, cameras: Mapping[str, Camera], k1: float = 0.0) -> float:
-    """Median reprojection error in pixels."""
+    """Median reprojection error in pixels, of the view where it is the largest; NaN where no view shows enough."""
     lengths = np.linalg.norm(reprojection(tracks, cameras, k1), axis=-1)
-    return float(np.nanmedian(lengths)) if len(tracks) else float("nan")
+    medians = [np.median(view[known]) for view in lengths.T if (known := np.isfinite(view)).sum() >= _LEAST_OF_A_VIEW]
+    return float(max(medians, default=np.nan))
+
+
+def _selected(tracks: Tracks) -> Tracks:
+    """Those that say the most, which many views show, and some of each view at least."""
+    order = np.argsort(-tracks.seen.sum(axis=1), kind="stable")
+    of_each = [order[tracks.seen[order, number]][: 4 * _LEAST_OF_A_VIEW] for number in range(len(tracks.views))]
+    return tracks.kept(np.unique(np.concatenate([order[: 2 * _MOST_POINTS], *of_each])))
 
 
 def fit_cameras(tracks: Tracks, told: Mapping[str, Camera]) -> FittedCameras | None:
@@ -195,11 +206,10 @@ def fit_cameras(tracks: Tracks, told: Mapping[str, Camera]) -> FittedCameras | N
     if len(tracks) < 2 * _LEAST_POINTS:
         return None
     scale = max(max(camera.width, camera.height) for camera in told.values()) / 240
-    # Those that most views show say the most.
-    order = np.argsort(-tracks.seen.sum(axis=1), kind="stable")[: 2 * _MOST_POINTS]
-    heard, asked = tracks.kept(order[::2]), tracks.kept(order[1::2])
+    chosen = _selected(tracks)
+    heard, asked = (chosen.kept(np.arange(first, len(chosen), 2)) for first in (0, 1))
     before = typical_error(asked, told)
-    if before < _RIGHT * scale:
+    if not np.isfinite(before) or before < _RIGHT * scale:
         return None
     problem = _Problem(heard, told)
     answers: list[tuple[float, dict[str, Camera], float, tuple[str, ...]]] = []
@@ -211,7 +221,7 @@ def fit_cameras(tracks: Tracks, told: Mapping[str, Camera]) -> FittedCameras | N
     after, cameras, k1, kinds = next(answer for answer in answers if answer[0] <= as_good)
     if not after < _BETTER * before:
         return None
-    few = [name for number, name in enumerate(tracks.views) if tracks.seen[:, number].sum() < _LEAST_OF_A_VIEW]
+    few = [name for number, name in enumerate(tracks.views) if heard.seen[:, number].sum() < _LEAST_OF_A_VIEW]
     return FittedCameras(cameras | {name: told[name] for name in few}, k1, kinds, before, after, len(tracks))
 
 
@@ -228,11 +238,13 @@ def _fitted(problem: _Problem, groups: list[NDArray[np.intp]], scale: float) -> 
             # The larger a change is, the less a pixel of it costs: a sum of sizes.
             prior[group] = min(spread, _FINEST * scale) / np.sqrt(np.linalg.norm(values[group]) / scale + _SMALL)
         prior *= np.sqrt(_PRIOR * seen.sum() / len(groups))
+        prior[-1] = 0.0  # a bend of all lenses leaves nothing open
 
-        # MINPACK counts the evaluations for derivatives, too.
-        most = _STEPS * (len(free) + 2)
         told = (problem, values, free, bound, prior[free] / scale)
-        values[free] = least_squares(_residual, values[free], method="lm", max_nfev=most, args=told).x
+        # With derivatives of its own, as releases of SciPy differ in whether evaluations for them count.
+        values[free] = least_squares(
+            _residual, values[free], _slopes, method="lm", x_scale=1.0, max_nfev=_STEPS, args=told
+        ).x
     return values
 
 
@@ -248,10 +260,23 @@ def _residual(
     values = values.copy()
     values[free] = changed
     errors = reprojection(problem.tracks, *problem.cameras(values))[problem.tracks.seen]
+    # Rays that never meet, as those of two cameras in one place, say nothing.
+    errors = np.nan_to_num(errors, nan=0.0, posinf=0.0, neginf=0.0)
     lengths = np.linalg.norm(errors, axis=-1, keepdims=True)
     # Each error scaled to the root of its loss.
     damped = errors * bound * np.sqrt(np.log1p((lengths / bound) ** 2)) / np.maximum(lengths, 1e-12)
     return np.concatenate([damped.ravel(), prior * changed])
+
+
+def _slopes(changed: NDArray[np.float64], *told: Any) -> NDArray[np.float64]:
+    """Derivatives of `_residual`, by forward differences."""
+    start = _residual(changed, *told)
+    slopes = np.empty((len(start), len(changed)))
+    for number in range(len(changed)):
+        beside = changed.copy()
+        beside[number] += _STEP
+        slopes[:, number] = (_residual(beside, *told) - start) / _STEP
+    return slopes
 
 
 def corrections(fitted: FittedCameras, told: Mapping[str, Camera]) -> dict[str, CameraCorrection]:

@@ -31,7 +31,7 @@ _SAME_STOPS, _SAME_CONTRAST = 0.04, 0.04
 # And those whose distance from it is not so many times as large as what half the points say otherwise.
 _TRUSTED = 4.0
 # How much less apart cameras have to be with contrast than without.
-_RICHER = 0.85
+_RICHER = 0.9
 
 
 @dataclass(frozen=True)

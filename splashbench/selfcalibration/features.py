@@ -115,7 +115,8 @@ def find_tracks(plates: Mapping[str, CleanPlate], cameras: Mapping[str, Camera])
         links.append(pairs[near] + [starts[a], starts[b]])
     owner = np.repeat(np.arange(len(views)), np.diff(starts))
     pixels = np.concatenate([features[name].pixels for name in views])
-    return Tracks(views, _joined(np.concatenate(links) if links else np.zeros((0, 2), np.intp), owner, pixels))
+    found = np.concatenate(links) if links else np.zeros((0, 2), np.intp)
+    return Tracks(views, _joined(found, owner, pixels, len(views)))
 
 
 def epipolar_distance(
@@ -131,12 +132,14 @@ def epipolar_distance(
     return np.asarray((lines[:, :2] * others).sum(axis=1) + lines[:, 2])
 
 
-def _joined(links: NDArray[np.intp], owner: NDArray[np.intp], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def _joined(
+    links: NDArray[np.intp], owner: NDArray[np.intp], pixels: NDArray[np.float64], n_views: int
+) -> NDArray[np.float64]:
     """Links between features as tracks [N, V, 2]; those that would show one view two points are left out."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    count, n_views = len(owner), int(owner.max()) + 1 if len(owner) else 0
+    count = len(owner)
     if not len(links):
         return np.zeros((0, n_views, 2))
     graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count))

@@ -9,8 +9,7 @@ import contextlib
 import shutil
 import subprocess
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +38,9 @@ class ExecutionOptions:
         retry: run again what failed before.
         lpips_weights: see `splashbench.score.image.lpips.load_lpips`.
         tell: is given a line for the user whenever a run starts.
+        order: gives the missing runs in the order in which they are made, and may leave some out; it is asked for the
+            next one once there is room for it. None for all, as planned.
+        pictures: keep a render of each run, see `Store.picture_path`.
     """
 
     only: tuple[str, ...] | None = None
@@ -47,6 +49,8 @@ class ExecutionOptions:
     retry: bool = False
     lpips_weights: Path | None = None
     tell: Callable[[str], None] = field(default=lambda line: None)
+    order: Callable[[Sequence[PlannedRun]], Iterator[PlannedRun]] | None = None
+    pictures: bool = False
 
 
 @dataclass
@@ -76,11 +80,12 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
             or (run.digest in needed and not store.reference_path(run.digest).is_dir())
         ]
         total = len(references) + len(missing)
+        chosen = iter(missing.values()) if options.order is None else options.order(list(missing.values()))
         progress = _Progress(total, options, _seconds_before(plan, store))
         # First what others are measured against; it also fits the backgrounds that they share.
-        for runs, is_reference in ((references, True), (missing.values(), False)):
-            _run_all([_job(plan, run, out, options, is_reference) for run in runs], options.jobs, progress)
-        return Tally(total, len({run.digest for run in selected}) - len(missing))
+        for runs, is_reference in ((references, True), (chosen, False)):
+            _run_all((_job(plan, run, out, options, is_reference) for run in runs), options.jobs, progress)
+        return Tally(progress.ended, len({run.digest for run in selected}) - len(missing))
 
 
 def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) -> bool:
@@ -119,6 +124,7 @@ def _job(plan: StudyPlan, run: PlannedRun, out: Path, options: ExecutionOptions,
         out=str(out),
         keep=options.keep,
         at_once=options.jobs,
+        picture=options.pictures,
     )
 
 
@@ -133,18 +139,18 @@ class _Progress:
 
     def __init__(self, total: int, options: ExecutionOptions, seconds: list[float]) -> None:
         self._total, self._jobs, self._tell = total, options.jobs, options.tell
-        self._seconds, self._started, self._ended = seconds, 0, 0
+        self._seconds, self._started, self.ended = seconds, 0, 0
 
     def starts(self, job: Job) -> None:
         self._started += 1
         remaining = ""
         if self._seconds:
             mean = sum(self._seconds) / len(self._seconds)
-            remaining = f", about {duration(mean * (self._total - self._ended) / self._jobs)} left"
+            remaining = f", about {duration(mean * (self._total - self.ended) / self._jobs)} left"
         self._tell(f"run {self._started} of {self._total}{remaining}: {job.title}")
 
     def ends(self, entry: RunEntry) -> None:
-        self._ended += 1
+        self.ended += 1
         self._seconds.append(entry.seconds)
         if entry.status != "ok":
             self._tell(f"failed: {entry.title}: {entry.status}: {entry.reason}")
@@ -158,18 +164,22 @@ def duration(seconds: float) -> str:
 
 
 def _run_all(jobs: Iterable[Job], at_once: int, progress: _Progress) -> None:
-    waiting = deque(jobs)
+    waiting = iter(jobs)
     if at_once == 1:
         for job in waiting:
             progress.starts(job)
             progress.ends(carry_out(job))
         return
     running: list[_Worker] = []
+    more = True
     try:
-        while waiting or running:
-            while waiting and len(running) < at_once:
-                progress.starts(waiting[0])
-                running.append(_Worker(waiting.popleft()))
+        while more or running:
+            while more and len(running) < at_once:
+                job = next(waiting, None)  # type: ignore[assignment]
+                more = job is not None
+                if more:
+                    progress.starts(job)
+                    running.append(_Worker(job))
             time.sleep(_POLL_SECONDS)
             for worker in [worker for worker in running if worker.has_ended()]:
                 running.remove(worker)

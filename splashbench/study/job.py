@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from splashbench.errors import DiskFullError, SplashbenchError, one_line
-from splashbench.files import read_model, write_model
+from splashbench.files import read_model, write_model, write_png
 from splashbench.harness.runner import run_method
 from splashbench.processes import terminable
 from splashbench.scene import Scene
@@ -48,6 +48,7 @@ class Job(BaseModel):
     out: str
     keep: bool
     at_once: int
+    picture: bool = False
 
 
 class RunEntry(BaseModel):
@@ -101,6 +102,10 @@ class Store:
 
     def entry_path(self, digest: str) -> Path:
         return self.runs / f"{digest[:16]}.json"
+
+    def picture_path(self, digest: str) -> Path:
+        """A render of the run: of the first test view, in the middle of the recording."""
+        return self.out / "pictures" / f"{digest[:16]}.png"
 
     def reference_path(self, digest: str) -> Path:
         """Folder of the submission of a reference run, which other runs are scored against."""
@@ -165,6 +170,8 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     # Evaluation data never change: the fields come from the scene itself, not from worse masks or fewer views.
     result = score_submission(scene, submission, reference, weights, fields=shared_fields(original))
     saved, faded = result.save(store.results), None
+    if job.picture and submission.status == Status.OK:
+        _keep_picture(submission, scene, store.picture_path(job.digest))
     if job.variant.withheld and submission.status == Status.OK:
         control = FadedSubmission(submission, scene)
         faded = score_submission(scene, control, reference, weights, fields=shared_fields(original)).save(store.results)
@@ -180,6 +187,11 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
             "train_views": list(scene.train),
         }
     )
+
+
+def _keep_picture(submission: Submission, scene: Scene, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, submission.rendering(scene.test[0], scene.n_frames // 2))
 
 
 def carry_out_file(file: str) -> int:

@@ -9,9 +9,11 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from splashbench.errors import SplashbenchError
 from splashbench.harness.discovery import load_method
+from splashbench.harness.runner import parse_overrides
 from splashbench.scene import Scene
 from splashbench.study.job import Store
 from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
@@ -78,7 +80,7 @@ def make_stress_plan(
     timeout_seconds: float | None = None,
     thin: Callable[[Scene], Scene] = lambda scene: scene,
 ) -> StressPlan:
-    """The runs of `methods` (each METHOD or METHOD:PRESET) on `scenes`, as recorded and with every harm.
+    """The runs of `methods` (each METHOD[:PRESET][:KEY=VALUE,...]) on `scenes`, as recorded and with every harm.
 
     thin: makes of each scene the one that is used (thinning.py).
 
@@ -97,7 +99,7 @@ def make_stress_plan(
     nothing = StudyVariant(name=f"{NOTHING}.{_AS_RECORDED}", method=NOTHING)
     variants = [nothing]
     rows: dict[str, tuple[str, Harm | None]] = {nothing.name: (NOTHING, None)}
-    for number, (label, (method, preset)) in enumerate(zip(labels, chosen)):
+    for number, (label, (method, preset, settings)) in enumerate(zip(labels, chosen)):
         # Methods may be called as they like, variants may not.
         plain = re.sub(r"[^A-Za-z0-9_-]", "_", label)
         plain = plain if plain == label and len(plain) <= _LONGEST_LABEL else f"{plain[: _LONGEST_LABEL - 3]}+{number}"
@@ -105,9 +107,8 @@ def make_stress_plan(
             name = f"{plain}.{_AS_RECORDED if harm is None else f'{harm.kind.named()}.{harm.level}'}"
             steps = [] if harm is None else [harm.step]
             rows[name] = label, harm
-            variants.append(
-                StudyVariant.model_validate({"name": name, "method": method, "preset": preset, "perturbation": steps})
-            )
+            row = {"name": name, "method": method, "preset": preset, "settings": settings, "perturbation": steps}
+            variants.append(StudyVariant.model_validate(row))
     spec = StudySpec(
         name="stress",
         title="Stability",
@@ -157,27 +158,31 @@ def higher_is_better(metric: str) -> bool:
     return metric_of(metric).better == "higher"
 
 
-def _parsed(text: str) -> tuple[str, str | None]:
-    """Method and preset of METHOD, METHOD:PRESET or FILE.py:CLASS[:PRESET]."""
+def _parsed(text: str) -> tuple[str, str | None, dict[str, Any]]:
+    """Method, preset and settings of METHOD or FILE.py:CLASS, with :PRESET, with :KEY=VALUE,KEY=VALUE, or with both."""
     parts = text.split(":")
+    settings = parse_overrides(parts.pop().split(",")) if "=" in parts[-1] and len(parts) > 1 else {}
     if parts[0].endswith(".py"):
         method, rest = ":".join(parts[:2]), parts[2:]
     else:
         method, rest = parts[0], parts[1:]
     if len(rest) > 1:
-        raise SplashbenchError(f"{text!r} is no method; write METHOD or METHOD:PRESET")
-    return method, rest[0] if rest else None
+        raise SplashbenchError(f"{text!r} is no method; write METHOD, METHOD:PRESET or METHOD:PRESET:KEY=VALUE")
+    return method, rest[0] if rest else None, settings
 
 
-def _labels(chosen: Sequence[tuple[str, str | None]]) -> list[str]:
-    """What each is called: the method's own name, with the preset where a method comes twice."""
-    names = [load_method(method).id for method, _ in chosen]
+def _labels(chosen: Sequence[tuple[str, str | None, Mapping[str, Any]]]) -> list[str]:
+    """What each is called: the method's own name, with what tells it apart where a method comes twice."""
+    names = [load_method(method).id for method, _, _ in chosen]
     if NOTHING in names:
         raise SplashbenchError(f"{NOTHING} is the control, and runs in any case; leave it out of the methods")
-    labels = [f"{n}-{preset}" if names.count(n) > 1 and preset else n for n, (_, preset) in zip(names, chosen)]
+    labels = []
+    for name, (_, preset, settings) in zip(names, chosen):
+        chosen_so = " ".join([f"{name}-{preset}" if preset else name, *(f"{k}={v}" for k, v in settings.items())])
+        labels.append(chosen_so if names.count(name) > 1 else name)
     twice = next((label for label in labels if labels.count(label) > 1), None)
     if twice is not None:
-        raise SplashbenchError(f"method {twice} is listed twice; give each its own preset, METHOD:PRESET")
+        raise SplashbenchError(f"method {twice} is listed twice; give each a preset or settings of its own")
     return labels
 
 

@@ -30,6 +30,7 @@ from splashbench.study.stability import (
     stability,
 )
 from splashbench.study.stress import METRICS, Harm, StressPlan, higher_is_better, stress_runs
+from splashbench.study.stress_pages import write_pages
 from splashbench.study.table_markdown import scenes_and_machines
 
 if TYPE_CHECKING:
@@ -67,15 +68,18 @@ def find(stress: StressPlan, store: Store, metric: str) -> Finding:
     points = {}
     for label, found in by_method.items():
         for kind, amounts in _amounts(stress.harms).items():
-            levels = [harm.level for harm in stress.harms if harm.kind.named() == kind]
-            # Levels in a row, whichever were asked for.
+            asked = [harm.level for harm in stress.harms if harm.kind.named() == kind]
+            # Levels in a row, whichever were asked for and made.
+            levels = [level for level in asked if any(r.kind == kind and r.level == level for r in found)]
+            if not levels:
+                continue
+            amounts = [amounts[0], *(amounts[1 + asked.index(level)] for level in levels)]
             ranked = {
                 StressRun(r.method, r.scene, r.seed, kind, levels.index(r.level) + 1, r.value): value
                 for r, value in found.items()
                 if r.kind == kind
             }
-            if {run.level for run in ranked} == set(range(1, len(levels) + 1)):
-                points[label, kind] = breakdown(ranked, kind, amounts)
+            points[label, kind] = breakdown(ranked, kind, amounts)
     results = _results(stress, store)
     mixed = {label for label, result in results if result.mixed} if metric_of(metric).filtered else set()
     scores = {label: stability(found) for label, found in by_method.items()}
@@ -92,8 +96,10 @@ def write_stress_report(stress: StressPlan, store: Store, out: Path, command: st
         names = ["stability.md", "stability.csv", "breakdown.csv", "retention.csv"]
         if findings and findings[0].breakdowns:
             names += [path.name for path in _draw(stress, findings[0], staging)]
-        write_text(staging / "stability.md", _markdown(stress, store, findings, command, "retention.png" in names))
-    return [Path(out, name) for name in names]
+        pages = write_pages(stress, store, findings[0].retentions, findings[0].metric, staging) if findings else []
+        text = _markdown(stress, store, findings, command, "retention.png" in names, pages)
+        write_text(staging / "stability.md", text)
+    return [Path(out, name) for name in [*names, *pages]]
 
 
 def _has(stress: StressPlan, store: Store, metric: str) -> bool:
@@ -177,10 +183,15 @@ def _retention_frame(stress: StressPlan, findings: Sequence[Finding]) -> pd.Data
     return pd.DataFrame(rows, columns=columns)
 
 
-def _markdown(stress: StressPlan, store: Store, findings: Sequence[Finding], command: str, with_chart: bool) -> str:
+def _markdown(
+    stress: StressPlan, store: Store, findings: Sequence[Finding], command: str, with_chart: bool, pages: Sequence[str]
+) -> str:
     parts = ["# Stability", f"```\n{command}\n```"]
     if with_chart:
         parts.append("![Retention by kind and severity](retention.png)")
+    links = [f"[{page.removeprefix('method_')[:-3]}]({page})" for page in pages if page.endswith(".md")]
+    if links:
+        parts.append(f"A page for each method, with pictures: {', '.join(links)}.")
     for finding in findings:
         parts += [f"## By {finding.metric}", _scores(finding), _points(stress, finding)]
         parts += [FILTER_NOTE] if finding.filtered else []
@@ -196,7 +207,10 @@ def _markdown(stress: StressPlan, store: Store, findings: Sequence[Finding], com
         lines = [f"{h.kind.named()} {h.amount:g} {h.kind.unit}: {one_line(reason)}" for h, reason in stress.left_out]
         parts += ["## Left out", bullets(lines)]
     if missing:
-        parts.append(f"{missing} runs are not made yet.")
+        parts.append(
+            f"**{missing} of {len(stress.plan.runs)} runs are not made yet.** Those made under a budget lie near where "
+            "methods break: breaking points compare, S and CVaR10 do not."
+        )
     parts.append(
         "S is the interquartile mean of retentions, CVaR10 the mean of the worst tenth; retention is the gain over "
         f"`nothing` as a share of the same method's gain on the recording as it is. It breaks where retention falls "

@@ -75,7 +75,7 @@ def test_a_second_time_nothing_is_run(study: Path, balls_directory: Path, capsys
         (["--methods", "splashsplat", "--kinds", "fog"], "no kind 'fog' of harm; give some of empty_masks"),
         (["--methods", "splashplat"], "did you mean 'splashsplat'"),
         (["--methods", "splashsplat:fast"], "fast"),
-        (["--methods", "splashsplat:quick:x"], "write METHOD or METHOD:PRESET"),
+        (["--methods", "splashsplat:quick:x"], "write METHOD, METHOD:PRESET"),
         (["--methods", "nothing"], "nothing is the control"),
         (["--methods", "hull_points", "hull_points"], "hull_points is listed twice"),
         (["--methods", "hull_points", "--kinds", "clock_offset", "--severities", "1"], "none of the harms is left"),

@@ -37,6 +37,9 @@ class PoseRotation(Step):
     kind: Literal["pose_rotation"] = "pose_rotation"
     amount: float = Field(ge=0, le=90)
     unit: ClassVar[str] = "deg"
+    remedy: ClassVar[str] = (
+        "Calibrate again where cameras were touched; `splashbench scene self-calibrate` tells which are turned."
+    )
     ladder: ClassVar[tuple[float, ...]] = (0.1, 0.25, 0.5, 1.0, 2.0)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -55,6 +58,7 @@ class PoseTranslation(Step):
     kind: Literal["pose_translation"] = "pose_translation"
     amount: float = Field(ge=0, le=1000)
     unit: ClassVar[str] = "mm"
+    remedy: ClassVar[str] = "Calibrate again where cameras were touched, with a board or COLMAP in view of all of them."
     ladder: ClassVar[tuple[float, ...]] = (1, 2, 5, 10, 20)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -77,6 +81,7 @@ class FocalError(Step):
     kind: Literal["focal_error"] = "focal_error"
     amount: float = Field(ge=0, le=50)
     unit: ClassVar[str] = "%"
+    remedy: ClassVar[str] = "Lock zoom and stabilisation, and calibrate with the settings of the recording."
     ladder: ClassVar[tuple[float, ...]] = (0.2, 0.5, 1, 2, 5)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -93,6 +98,7 @@ class PrincipalPointError(Step):
     kind: Literal["principal_point_error"] = "principal_point_error"
     amount: float = Field(ge=0, le=1000)
     unit: ClassVar[str] = "px"
+    remedy: ClassVar[str] = "Turn electronic stabilisation off, and crop images and cameras alike."
     ladder: ClassVar[tuple[float, ...]] = (0.5, 1, 2, 4, 8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -110,6 +116,7 @@ class LensDistortion(Step):
     kind: Literal["lens_distortion"] = "lens_distortion"
     amount: float = Field(ge=0, le=0.3)
     unit: ClassVar[str] = "k1"
+    remedy: ClassVar[str] = "Undistort photographs and masks before they become a scene, as `splashbench prepare` does."
     ladder: ClassVar[tuple[float, ...]] = (0.005, 0.01, 0.02, 0.05, 0.1)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -131,6 +138,7 @@ class CameraMoved(Step):
     kind: Literal["camera_moved"] = "camera_moved"
     amount: float = Field(ge=0, le=45)
     unit: ClassVar[str] = "deg"
+    remedy: ClassVar[str] = "Weigh tripods down and use a remote; cut the recording where a camera moved."
     ladder: ClassVar[tuple[float, ...]] = (0.1, 0.25, 0.5, 1.0, 2.0)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:

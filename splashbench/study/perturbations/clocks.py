@@ -45,6 +45,9 @@ class ClockOffset(Step):
     kind: Literal["clock_offset"] = "clock_offset"
     amount: float = Field(ge=0, le=10_000)
     unit: ClassVar[str] = "ms"
+    remedy: ClassVar[str] = (
+        "Clap, or use a timecode; `splashbench prepare` aligns by sound. More droplets in view let the offset be found."
+    )
     ladder: ClassVar[tuple[float, ...]] = (8, 16, 33, 66, 100)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -59,6 +62,7 @@ class ClockOffsets(Step):
     kind: Literal["clock_offsets"] = "clock_offsets"
     amount: float = Field(ge=0, le=10_000)
     unit: ClassVar[str] = "ms"
+    remedy: ClassVar[str] = "Clap, or use a timecode, and check every camera by the sound."
     ladder: ClassVar[tuple[float, ...]] = (8, 16, 33, 66, 100)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -72,6 +76,7 @@ class ClockDrift(Step):
     kind: Literal["clock_drift"] = "clock_drift"
     amount: float = Field(ge=0, le=500_000)
     unit: ClassVar[str] = "ppm"
+    remedy: ClassVar[str] = "Sync at the end of a recording, too, or keep it short."
     ladder: ClassVar[tuple[float, ...]] = (5_000, 10_000, 20_000, 50_000, 100_000)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -88,6 +93,7 @@ class RollingShutter(Step):
     kind: Literal["rolling_shutter"] = "rolling_shutter"
     amount: float = Field(ge=0, le=1000)
     unit: ClassVar[str] = "ms a frame"
+    remedy: ClassVar[str] = "Use a global shutter, or the fastest readout: lower resolution, higher frame rate."
     ladder: ClassVar[tuple[float, ...]] = (9, 12, 17, 25, 34)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -117,6 +123,7 @@ class DroppedFrames(Step):
     kind: Literal["dropped_frames"] = "dropped_frames"
     amount: float = Field(ge=0, lt=1)
     unit: ClassVar[str] = "share of frames"
+    remedy: ClassVar[str] = "Use faster cards, and check that the frames' times are even."
     ladder: ClassVar[tuple[float, ...]] = (0.02, 0.05, 0.1, 0.2, 0.4)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -130,6 +137,7 @@ class DoubledFrames(Step):
     kind: Literal["doubled_frames"] = "doubled_frames"
     amount: float = Field(ge=0, lt=1)
     unit: ClassVar[str] = "share of frames"
+    remedy: ClassVar[str] = "Record at a constant frame rate, and check that no two frames are alike."
     ladder: ClassVar[tuple[float, ...]] = (0.02, 0.05, 0.1, 0.2, 0.4)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -152,6 +160,7 @@ class MotionBlur(Step):
     kind: Literal["motion_blur"] = "motion_blur"
     amount: float = Field(ge=0, le=1000)
     unit: ClassVar[str] = "ms"
+    remedy: ClassVar[str] = "Shorten the shutter, and add light."
     ladder: ClassVar[tuple[float, ...]] = (17, 25, 34, 50, 67)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:

@@ -47,6 +47,7 @@ class Exposure(Step):
     kind: Literal["exposure"] = "exposure"
     amount: float = Field(ge=0, le=4)
     unit: ClassVar[str] = "EV"
+    remedy: ClassVar[str] = "Lock exposure in all cameras."
     ladder: ClassVar[tuple[float, ...]] = (0.1, 0.25, 0.5, 1.0, 1.5)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -62,6 +63,7 @@ class WhiteBalance(Step):
     kind: Literal["white_balance"] = "white_balance"
     amount: float = Field(ge=0, le=2)
     unit: ClassVar[str] = "EV"
+    remedy: ClassVar[str] = "Lock white balance in all cameras."
     ladder: ClassVar[tuple[float, ...]] = (0.05, 0.1, 0.2, 0.4, 0.8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -80,6 +82,7 @@ class Gamma(Step):
     kind: Literal["gamma"] = "gamma"
     amount: float = Field(ge=0, le=2)
     unit: ClassVar[str] = "octaves of the exponent"
+    remedy: ClassVar[str] = "Use the same picture profile in all cameras."
     ladder: ClassVar[tuple[float, ...]] = (0.05, 0.1, 0.2, 0.4, 0.8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -95,6 +98,7 @@ class SensorNoise(Step):
     kind: Literal["sensor_noise"] = "sensor_noise"
     amount: float = Field(ge=0, le=255)
     unit: ClassVar[str] = "levels of 255"
+    remedy: ClassVar[str] = "Add light, and lower the gain."
     ladder: ClassVar[tuple[float, ...]] = (2, 5, 10, 20, 40)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -111,6 +115,7 @@ class Defocus(Step):
     kind: Literal["defocus"] = "defocus"
     amount: float = Field(ge=0, le=100)
     unit: ClassVar[str] = "px"
+    remedy: ClassVar[str] = "Focus by hand on the liquid, and close the aperture."
     ladder: ClassVar[tuple[float, ...]] = (0.5, 1, 2, 4, 8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -131,6 +136,7 @@ class Haze(Step):
     kind: Literal["haze"] = "haze"
     amount: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of the light"
+    remedy: ClassVar[str] = "Wipe lenses, and keep steam out of the line of sight."
     ladder: ClassVar[tuple[float, ...]] = (0.05, 0.1, 0.2, 0.4, 0.6)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -146,6 +152,7 @@ class MovingShadow(Step):
     kind: Literal["moving_shadow"] = "moving_shadow"
     amount: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of the light"
+    remedy: ClassVar[str] = "Keep people away from the lamps."
     ladder: ClassVar[tuple[float, ...]] = (0.1, 0.2, 0.4, 0.6, 0.8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -168,6 +175,7 @@ class Passer(Step):
     kind: Literal["person_walking_past"] = "person_walking_past"
     amount: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of the image's height"
+    remedy: ClassVar[str] = "Keep people out of all views, or hang a backdrop."
     ladder: ClassVar[tuple[float, ...]] = (0.2, 0.4, 0.6, 0.8, 1.0)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -193,6 +201,7 @@ class Compression(Step):
     kind: Literal["compression"] = "compression"
     amount: float = Field(ge=0, le=51)
     unit: ClassVar[str] = "CRF"
+    remedy: ClassVar[str] = "Record at the highest bit rate, and work from the originals."
     none: ClassVar[float] = 18.0  # what passes for no loss
     ladder: ClassVar[tuple[float, ...]] = (28, 33, 38, 43, 48)
 

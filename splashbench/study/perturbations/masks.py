@@ -55,6 +55,7 @@ class EmptyMasks(MaskShare):
     kind: Literal["empty_masks"]
     share: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of masks"
+    remedy: ClassVar[str] = "Look through the masks (`splashbench masks`), and mend or leave out those that failed."
     ladder: ClassVar[tuple[float, ...]] = (0.02, 0.05, 0.086, 0.15, 0.3)
     measured: ClassVar[str] = "share"
 
@@ -68,6 +69,7 @@ class MissingParts(MaskShare):
     kind: Literal["missing_parts"]
     target_iou: float = Field(ge=0.2, le=1)
     unit: ClassVar[str] = "IoU with the true mask"
+    remedy: ClassVar[str] = "Mend masks that miss parts: most of all lower ones, which hide in highlights."
     ladder: ClassVar[tuple[float, ...]] = (0.96, 0.9, 0.77, 0.6, 0.36)
     measured: ClassVar[str] = "target_iou"
     none: ClassVar[float] = 1.0
@@ -103,6 +105,7 @@ class ErodedMasks(Step):
     kind: Literal["eroded_masks"] = "eroded_masks"
     amount: int = Field(ge=0, le=500)
     unit: ClassVar[str] = "px"
+    remedy: ClassVar[str] = "Check that masks reach the outline, and grow them where they do not."
     ladder: ClassVar[tuple[float, ...]] = (1, 2, 4, 8, 16)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -115,6 +118,7 @@ class GrownMasks(Step):
     kind: Literal["grown_masks"] = "grown_masks"
     amount: int = Field(ge=0, le=500)
     unit: ClassVar[str] = "px"
+    remedy: ClassVar[str] = "Check that masks end at the outline: glow and wet edges are no liquid."
     ladder: ClassVar[tuple[float, ...]] = (1, 2, 4, 8, 16)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -127,6 +131,7 @@ class HoledMasks(Step):
     kind: Literal["holed_masks"] = "holed_masks"
     amount: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of pixels"
+    remedy: ClassVar[str] = "Fill holes at highlights."
     ladder: ClassVar[tuple[float, ...]] = (0.02, 0.05, 0.1, 0.2, 0.4)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -145,6 +150,7 @@ class FlickeringMasks(Step):
     kind: Literal["flickering_masks"] = "flickering_masks"
     amount: float = Field(ge=0, le=100)
     unit: ClassVar[str] = "px"
+    remedy: ClassVar[str] = "Smooth masks over time, or track them instead of segmenting each frame."
     ladder: ClassVar[tuple[float, ...]] = (0.5, 1, 2, 4, 8)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:
@@ -165,6 +171,7 @@ class WrongMasks(Step):
     kind: Literal["wrong_masks"] = "wrong_masks"
     amount: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of a camera's masks"
+    remedy: ClassVar[str] = "Look through the masks of each camera: a tracker may have followed something else."
     ladder: ClassVar[tuple[float, ...]] = (0.1, 0.25, 0.5, 0.75, 1.0)
 
     def applied(self, recording: Recording, dice: Dice) -> Recording:

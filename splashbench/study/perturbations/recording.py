@@ -96,11 +96,13 @@ class Step(BaseModel):
     """One thing that is wrong with a recording.
 
     unit: of its amount. ladder: five amounts, from what is hardly seen to what nobody would accept. measured: the name
-    of the field that holds the amount. none: the amount of a recording as it is.
+    of the field that holds the amount. none: the amount of a recording as it is. remedy: what to do about it in one's
+    own recording, a sentence.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     unit: ClassVar[str]
+    remedy: ClassVar[str]
     ladder: ClassVar[tuple[float, ...]]
     measured: ClassVar[str] = "amount"
     none: ClassVar[float] = 0.0

@@ -1,0 +1,135 @@
+"""Cameras that stand or look elsewhere than they are told are found by the points that views have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splashbench.background.clean_plate import CleanPlate
+from splashbench.scene import Camera
+from splashbench.selfcalibration.cameras import FittedCameras, corrections, fit_cameras, typical_error
+from splashbench.selfcalibration.features import Tracks, epipolar_distance, find_tracks
+
+from .conftest import SIZE, photograph, plate_of, turned
+
+Cameras = dict[str, Camera]
+
+
+def misplaced(first: Camera, second: Camera) -> float:
+    """How far apart in pixels two cameras see the same points above the table, typically."""
+    grid = np.meshgrid(np.linspace(-0.7, 0.7, 7), np.linspace(0, 0.6, 3), np.linspace(-0.9, 0.7, 7))
+    points = np.stack(grid, axis=-1).reshape(-1, 3)
+    return float(np.median(np.linalg.norm(first.project(points)[0] - second.project(points)[0], axis=1)))
+
+
+def with_intrinsics(camera: Camera, focal: float = 1.0, shift: float = 0.0) -> Camera:
+    K = np.array(camera.K)
+    K[[0, 1], [0, 1]] *= focal
+    K[0, 2] += shift
+    return replace(camera, K=K)
+
+
+def moved(camera: Camera, away: float) -> Camera:
+    w2c = np.array(camera.w2c)
+    w2c[0, 3] += away
+    return replace(camera, w2c=w2c)
+
+
+def fitted(tracks: Tracks, told: Cameras) -> FittedCameras:
+    found = fit_cameras(tracks, told)
+    assert found is not None
+    return found
+
+
+def test_points_lie_where_right_cameras_see_them(tracks: Tracks, cameras: Cameras) -> None:
+    assert tracks.views == tuple(cameras)
+    assert len(tracks) > 500
+    both = tracks.seen[:, 1] & tracks.seen[:, 2]
+    away = epipolar_distance(cameras["2"], cameras["3"], tracks.pixels[both, 1], tracks.pixels[both, 2])
+    assert np.median(np.abs(away)) < 0.1
+    assert typical_error(tracks, cameras) < 0.08
+
+
+def test_right_cameras_are_left_as_told(tracks: Tracks, cameras: Cameras) -> None:
+    assert fit_cameras(tracks, cameras) is None
+
+
+def test_a_turned_camera_is_found_and_the_others_stay(tracks: Tracks, cameras: Cameras) -> None:
+    told = cameras | {"2": turned(cameras["2"], 0.5)}
+    found = fitted(tracks, told)
+    assert found.kinds == ("turned",)
+    assert found.after < 0.15 * found.before
+    degrees = {name: change.turned for name, change in corrections(found, told).items()}
+    assert degrees.pop("2") == pytest.approx(0.5, abs=0.1)
+    assert max(degrees.values()) < 0.1
+    assert misplaced(found.cameras["2"], cameras["2"]) < 0.2 * misplaced(told["2"], cameras["2"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "other", "share"),
+    [
+        ("shifted", lambda camera: with_intrinsics(camera, shift=3.0), 0.15),
+        ("longer", lambda camera: with_intrinsics(camera, focal=1.03), 0.15),
+        # All cameras may have moved a little instead: what is found of one is about two thirds.
+        ("moved", lambda camera: moved(camera, 0.03), 0.45),
+    ],
+)
+def test_what_is_wrong_with_a_camera_is_told_apart_and_undone(
+    tracks: Tracks, cameras: Cameras, kind: str, other: Callable[[Camera], Camera], share: float
+) -> None:
+    told = cameras | {"4": other(cameras["4"])}
+    found = fitted(tracks, told)
+    assert found.kinds == (kind,)
+    assert found.distortion == 0
+    assert found.after < 0.15 * found.before
+    injected = misplaced(told["4"], cameras["4"])
+    assert injected > 1
+    for name, camera in found.cameras.items():
+        assert misplaced(camera, cameras[name]) < share * injected
+
+
+def test_lenses_that_bend_are_found(cameras: Cameras) -> None:
+    plates = {name: plate_of(camera, photograph(camera, k1=-0.2)) for name, camera in cameras.items()}
+    found = fitted(find_tracks(plates, cameras), cameras)
+    assert found.kinds == ("bent",)
+    assert found.distortion == pytest.approx(-0.2, abs=0.02)
+    for name, camera in found.cameras.items():
+        assert misplaced(camera, cameras[name]) < 0.05
+
+
+def test_noise_has_nothing_in_common(cameras: Cameras) -> None:
+    rng = np.random.default_rng(4)
+    told = cameras | {"2": turned(cameras["2"], 0.5)}
+    noise = {name: rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8) for name in cameras}
+    tracks = find_tracks({name: plate_of(cameras[name], image) for name, image in noise.items()}, cameras)
+    assert len(tracks) < 30
+    assert fit_cameras(tracks, told) is None
+
+
+def test_too_few_points_say_nothing(tracks: Tracks, cameras: Cameras) -> None:
+    told = cameras | {"2": turned(cameras["2"], 0.5)}
+    assert fit_cameras(tracks.kept(np.arange(100)), told) is None
+
+
+@pytest.mark.parametrize("name", ["1", "5"])
+def test_a_view_that_shows_nothing_stays_as_told(
+    name: str, plates: dict[str, CleanPlate], cameras: Cameras, images: dict[str, NDArray[np.uint8]]
+) -> None:
+    """The last view, too."""
+    blank = plates | {name: plate_of(cameras[name], np.full_like(images[name], 90))}
+    tracks = find_tracks(blank, cameras)
+    assert tracks.pixels.shape[1:] == (5, 2)
+    assert not tracks.seen[:, list(cameras).index(name)].any()
+    assert tracks.seen.sum(axis=0).min() == 0
+    assert typical_error(tracks, cameras) < 0.08
+
+
+def test_plates_without_any_feature_have_no_tracks(cameras: Cameras) -> None:
+    grey = {name: plate_of(camera, np.full((*SIZE[::-1], 3), 90, np.uint8)) for name, camera in cameras.items()}
+    tracks = find_tracks(grey, cameras)
+    assert tracks.pixels.shape == (0, 5, 2)
+    assert fit_cameras(tracks, cameras) is None
