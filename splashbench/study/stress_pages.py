@@ -137,7 +137,8 @@ def _remedy(kind: type) -> str:
 def _place(row: KindSummary, ladder: Sequence[float], unit: str) -> str:
     if row.breaks_at is None:
         return f"not up to {ladder[max(row.kept) - 1]:g} {unit}"
-    return f"{ladder[row.breaks_at - 1]:g} {unit}"
+    sooner = any(level not in row.kept for level in range(1, row.breaks_at))
+    return f"{ladder[row.breaks_at - 1]:g} {unit}" + (", or sooner" if sooner else "")
 
 
 def _picture(stress: StressPlan, store: Store, label: str, rows: Sequence[KindSummary]) -> NDArray[np.uint8] | None:
