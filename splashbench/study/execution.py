@@ -138,11 +138,16 @@ class _Progress:
     """Tells the user before each run which one it is and about how long the rest takes."""
 
     def __init__(self, total: int, options: ExecutionOptions, seconds: list[float]) -> None:
-        self._total, self._jobs, self._tell = total, options.jobs, options.tell
+        # How many there will be is not known where the order may leave some out.
+        self._total = total if options.order is None else None
+        self._jobs, self._tell = options.jobs, options.tell
         self._seconds, self._started, self.ended = seconds, 0, 0
 
     def starts(self, job: Job) -> None:
         self._started += 1
+        if self._total is None:
+            self._tell(f"run {self._started}: {job.title}")
+            return
         remaining = ""
         if self._seconds:
             mean = sum(self._seconds) / len(self._seconds)
