@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clean_plate
+from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clean_plate, make_clean_plates
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, read_npz
 from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
@@ -153,10 +153,7 @@ def clean_plates(scene: TrainingScene, n_frames: int = MAX_FRAMES) -> Plates:
 
     Raises SplashbenchError where masks cover everything in more than one frame.
     """
-    plates = {}
-    for name in scene.train:
-        camera = scene.cameras[name]
-        plates[name] = make_clean_plate(scene, name, max(camera.width, camera.height), n_frames)
+    plates = make_clean_plates(scene, n_frames)
     if n_frames > 1 and not any(plate.seen.any() for plate in plates.values()):
         raise _covered(scene, "throughout")
     return plates

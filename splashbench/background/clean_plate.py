@@ -82,6 +82,12 @@ def make_clean_plate(
     return CleanPlate(small, masked_median(images, dry), np.asarray(dry.any(axis=0)), beside)
 
 
+def make_clean_plates(scene: TrainingScene, n_frames: int = MAX_FRAMES) -> dict[str, CleanPlate]:
+    """The plate of every training view of `scene`, in its size, of at most `n_frames` frames."""
+    sizes = {name: max(camera.width, camera.height) for name, camera in scene.cameras.items()}
+    return {name: make_clean_plate(scene, name, sizes[name], n_frames) for name in scene.train}
+
+
 def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Lower median over the first axis of uint8 [T, H, W, 3] where bool [T, H, W] allows; 0 where it never does."""
     median = np.zeros(images.shape[1:], np.uint8)

@@ -55,9 +55,9 @@ class CameraCorrection:
 
 @dataclass(frozen=True)
 class FittedCameras:
-    """cameras: by name, as fitted. distortion: k1 of all views (OpenCV's model), 0 where there is none. kinds: of
-    what was changed. before, after:
-    the median reprojection error in pixels of points that had no say in the fit. points: how many there were."""
+    """cameras: by name, as fitted. distortion: k1 of all views (OpenCV's model), 0 where there is none. kinds: what was
+    changed. before, after: the `typical_error` in pixels of points that had no say in the fit. points: how many views
+    have in common."""
 
     cameras: Mapping[str, Camera]
     distortion: float
@@ -215,7 +215,7 @@ def fit_cameras(tracks: Tracks, told: Mapping[str, Camera]) -> FittedCameras | N
     answers: list[tuple[float, dict[str, Camera], float, tuple[str, ...]]] = []
     for kinds in _ANSWERS:
         cameras, k1 = problem.cameras(_fitted(problem, problem.groups(kinds), scale))
-        answers.append((typical_error(asked, cameras, k1), cameras, k1, kinds))
+        answers.append((float(np.nan_to_num(typical_error(asked, cameras, k1), nan=np.inf)), cameras, k1, kinds))
     best = min(answer[0] for answer in answers)
     as_good = _AS_GOOD * best + _AS_GOOD_PIXELS * scale
     after, cameras, k1, kinds = next(answer for answer in answers if answer[0] <= as_good)
@@ -231,7 +231,7 @@ def _fitted(problem: _Problem, groups: list[NDArray[np.intp]], scale: float) -> 
     seen = problem.tracks.seen
     for _ in range(_ROUNDS):
         lengths = np.linalg.norm(reprojection(problem.tracks, *problem.cameras(values)), axis=-1)[seen]
-        spread = max(float(np.median(lengths)), 0.02 * scale)
+        spread = max(float(np.median(np.nan_to_num(lengths))), 0.02 * scale)
         bound = _OUTLIER * spread
         prior = np.zeros(problem.count)
         for group in groups:

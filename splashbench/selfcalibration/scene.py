@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clean_plate
+from splashbench.background.clean_plate import CleanPlate, make_clean_plates
 from splashbench.scene import Camera
 from splashbench.scene.scene import TrainingScene
 
@@ -193,7 +193,7 @@ def self_calibration(
     found = SelfCalibration(seconds_per_step=step, knocks=knocks)
     told("comparing what cameras show in common")
     steady = found.scene(scene)
-    shown = plates() if plates is not None and not knocks else clean_plates(steady)
+    shown = plates() if plates is not None and not knocks else make_clean_plates(steady)
     shown = {name: plate.without_beside() for name, plate in shown.items()}
     tracks = find_tracks(shown, scene.cameras)
     found = replace(found, cameras=fit_cameras(tracks, scene.cameras))
@@ -209,12 +209,6 @@ def self_calibration(
         }
         found = replace(found, offsets=clock_offsets(drops, right.cameras, _down(right)))
     return found
-
-
-def clean_plates(scene: TrainingScene) -> dict[str, CleanPlate]:
-    """The plate of every training view, in its size."""
-    sizes = {name: max(camera.width, camera.height) for name, camera in scene.cameras.items()}
-    return {name: make_clean_plate(scene, name, sizes[name], MAX_FRAMES) for name in scene.train}
 
 
 def _down(scene: TrainingScene) -> NDArray[np.float64]:

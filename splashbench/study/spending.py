@@ -31,10 +31,9 @@ class Cell:
 
 @dataclass
 class Budget:
-    """Runs within `seconds`, `jobs` at a time. clock: seconds, from any start."""
+    """Runs within `seconds`. clock: seconds, from any start."""
 
     seconds: float
-    jobs: int = 1
     clock: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, write_text
-from splashbench.markdown import one_line
 from splashbench.markdown import table as markdown_table
 from splashbench.scene import Scene
 from splashbench.study.job import Store
@@ -124,14 +123,10 @@ def _page(stress: StressPlan, label: str, rows: Sequence[KindSummary], metric: s
     if broken:
         advice = {
             "kind": [f"`{row.kind}`" for row in broken],
-            "in your own recording": [_remedy(kinds[row.kind]) for row in broken],
+            "in your own recording": [kinds[row.kind].remedy for row in broken],
         }
         parts += ["## What to do about it", markdown_table(advice)]
-    return "\n\n".join(map(str, parts)) + "\n"
-
-
-def _remedy(kind: type) -> str:
-    return one_line(str(getattr(kind, "remedy", "")))
+    return "\n\n".join(parts) + "\n"
 
 
 def _place(row: KindSummary, ladder: Sequence[float], unit: str) -> str:
