@@ -110,7 +110,9 @@ class FittedSplashSplat(Fitted):
             else:
                 behind = torch.from_numpy(self._background(camera))
                 wall, in_front = cut or (None, None)
-                rgb, alpha = composite(children, camera, behind, wall=wall, in_front=in_front)
+                glass = self.liquid.appearance.glass
+                before = None if glass is None else glass.seen(torch.tensor(camera.center, dtype=torch.float32))
+                rgb, alpha = composite(children, camera, behind, wall=wall, in_front=in_front, glass=before)
             return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
 
     def particles(self) -> Particles:

@@ -19,6 +19,7 @@ from splashbench.scene.particles import Particles
 
 from .appearance.decoder import Decoder, DecoderSettings
 from .appearance.fitting import Appearance, Composition
+from .appearance.glass import Glass
 from .carriers.between import BetweenFrames
 from .carriers.population import Carriers
 from .carriers.subframe import Track
@@ -26,7 +27,10 @@ from .motion.fall import falls_of, table_of
 from .motion.steps import Motion
 from .motion.velocity import Factor
 
-FORMAT = 3
+# Of models with glass; readers of before would leave it out and not say so.
+FORMAT, FORMAT_WITHOUT_GLASS = 4, 3
+_GLASS = "glass."
+_GLASS_RANKS = {"positions": 2, "log_scales": 2, "quaternions": 2, "opacities": 1, "colors": 2, "slopes": 3}
 
 
 def _position_steps(grid: Grid) -> float:
@@ -89,7 +93,7 @@ class Liquid:
     ) -> Liquid:
         """Bring the learned tables and the motion to the precision of the files."""
         halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
-        appearance = Appearance(halves[0], halves[1], appearance.decoder)
+        appearance = Appearance(halves[0], halves[1], appearance.decoder, appearance.glass)
         return cls(times, grid, carriers, motion.half(), phi, appearance, carried, composition, between_frames)
 
     @property
@@ -126,7 +130,7 @@ class Liquid:
         """Write liquid.json and four .npz files into `directory`."""
         settings = self.appearance.decoder.settings
         header = {
-            "format": FORMAT,
+            "format": FORMAT_WITHOUT_GLASS if self.appearance.glass is None else FORMAT,
             "times": [float(t) for t in self.times],
             "grid": {
                 "origin": [float(x) for x in self.grid.origin],
@@ -155,11 +159,13 @@ class Liquid:
         np.savez_compressed(directory / "velocity.npz", velocities=self.motion.velocities, jets=jets, turn=turn)
         np.savez_compressed(directory / "phi.npz", phi=self.phi)
         heads = {f"heads.{name}": value.numpy() for name, value in self.appearance.decoder.state_dict().items()}
+        glass = {} if self.appearance.glass is None else self.appearance.glass.tables
         np.savez_compressed(
             directory / "appearance.npz",
             features=self.appearance.features.half().numpy(),
             log_scales=self.appearance.log_scales.half().numpy(),
             **heads,
+            **{f"{_GLASS}{name}": table.numpy() for name, table in glass.items()},
         )
 
     @classmethod
@@ -168,8 +174,9 @@ class Liquid:
         path = directory / "liquid.json"
         header = read_json(path)
         try:
-            if header["format"] != FORMAT:
+            if header["format"] not in (FORMAT, FORMAT_WITHOUT_GLASS):
                 raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; fit the scene again")
+            with_glass = header["format"] == FORMAT
             box = header["grid"]
             nx, ny, nz = (int(n) for n in box["shape"])
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
@@ -207,10 +214,12 @@ class Liquid:
         british = "colour_width" in header["decoder"]
         heads = {name: f"heads.{name.replace('color', 'colour') if british else name}" for name in decoder.state_dict()}
         shapes = {heads[name]: value.ndim for name, value in decoder.state_dict().items()}
-        tables = read_npz(directory / "appearance.npz", {"features": 2, "log_scales": 2, **shapes})
+        panes = {f"{_GLASS}{name}": rank for name, rank in _GLASS_RANKS.items()} if with_glass else {}
+        tables = read_npz(directory / "appearance.npz", {"features": 2, "log_scales": 2, **shapes, **panes})
         try:
+            glass = Glass.of_tables({name: tables[f"{_GLASS}{name}"] for name in _GLASS_RANKS}) if with_glass else None
             decoder.load_state_dict({name: torch.from_numpy(tables[stored]) for name, stored in heads.items()})
-        except RuntimeError:
+        except (RuntimeError, ValueError):
             raise SplashbenchError(
                 f"{directory / 'appearance.npz'} does not fit liquid.json; fit the scene again"
             ) from None
@@ -218,5 +227,6 @@ class Liquid:
             torch.from_numpy(tables["features"].astype(np.float32)),
             torch.from_numpy(tables["log_scales"].astype(np.float32)),
             decoder,
+            glass,
         )
         return cls(times, grid, carriers, motion, phi, appearance, carried, composition, between)

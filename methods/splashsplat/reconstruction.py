@@ -16,11 +16,13 @@ from splashbench.harness.contract import Run
 from splashbench.native import memory
 from splashbench.observe.container import solid_distance
 from splashbench.render import Frozen
+from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene.scene import TrainingScene
 
 from .appearance.coarse import set_half_backgrounds, with_half_size
 from .appearance.first_look import photographed, take_on
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
+from .appearance.glass import glass_before
 from .appearance.targets import collect_targets, set_backgrounds
 from .carriers.coverage import uncovered_by_any
 from .carriers.population import Carriers
@@ -250,6 +252,8 @@ def _fit_appearance(
         }
         with_half_size(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
     memory.give_back()
+    if observations.in_transparent_container and frozen is None:
+        appearance.glass = glass_before(track, config.glass, seed)
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
     if config.first_look:
@@ -268,6 +272,7 @@ def _fit_appearance(
 
 def _pruned(carriers: Carriers, appearance: Appearance, kept: np.ndarray) -> tuple[Carriers, Appearance]:
     """The carriers `kept` (bool [count]) alone: without phantom volume of the hull, which the images made transparent,
-    and without what they do not show."""
+    and without what they do not show. And the glass that can be seen."""
     carriers, rows = carriers.keep(kept)
-    return carriers, Appearance(appearance.features[rows], appearance.log_scales[rows], appearance.decoder)
+    glass = None if appearance.glass is None else appearance.glass.kept(MIN_ALPHA)
+    return carriers, Appearance(appearance.features[rows], appearance.log_scales[rows], appearance.decoder, glass)

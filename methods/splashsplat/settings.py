@@ -37,7 +37,7 @@ _DRAFT_PLATES_SHARE = 0.25
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "14"
+VERSION = "15"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -162,6 +162,10 @@ class SplashSplatConfig(MethodConfig):
     covariance_weight: float = Field(0.01, ge=0)
     separation_weight: float = Field(0.1, ge=0)
     color_weight: float = Field(1.0, ge=0)
+    #: of what photographs show beside the liquid, where there is `glass`
+    beside_weight: float = Field(0.4, ge=0)
+    #: Gaussians of a transparent container before the liquid, to begin with; 0 for none
+    glass: int = Field(4000, ge=0, le=100_000)
     #: carriers whose learned opacity falls below this are dropped, eight times during the fit and at its end; 0 keeps
     #: all
     prune_opacity: float = Field(0.01, ge=0, lt=1)
@@ -246,6 +250,7 @@ class SplashSplatConfig(MethodConfig):
             "idle_share": 0.0,
             "coarse_share": 0.0,
             "plates_share": 0.0,
+            "glass": 0,
             "first_look": False,
             "background_preset": "paper",
             "draft_cells": 0,
@@ -353,6 +358,7 @@ class SplashSplatConfig(MethodConfig):
                 "iterations": _DRAFT_ITERATIONS,
                 "validation_share": 0.0,
                 "idle_share": 0.0,
+                "glass": 0,
                 "plates_share": _DRAFT_PLATES_SHARE,
             }
         )
@@ -414,5 +420,6 @@ class SplashSplatConfig(MethodConfig):
                 covariance=self.covariance_weight,
                 separation=self.separation_weight,
                 color=self.color_weight,
+                beside=self.beside_weight,
             ),
         )

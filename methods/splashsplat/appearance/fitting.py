@@ -25,6 +25,7 @@ from . import losses
 from .active import Active, ActiveCarriers
 from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
+from .glass import Glass, GlassFit, Splats
 from .optimizer import RowAdam
 from .photographs import ReadAhead, read_now
 from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
@@ -84,11 +85,13 @@ class FitSettings:
 
 @dataclass
 class Appearance:
-    """What the fit learns: features [count, size] and log_scales [count, 3] of the carriers, and the heads."""
+    """What the fit learns: features [count, size] and log_scales [count, 3] of the carriers, the heads, and the glass
+    before the liquid, where it is in a transparent container."""
 
     features: Tensor
     log_scales: Tensor
     decoder: Decoder
+    glass: Glass | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,7 @@ def composite(
     modes: np.ndarray | None = None,
     wall: Tensor | None = None,
     in_front: Tensor | None = None,
+    glass: Splats | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Liquid and background: rgb [h, w, 3], and the opacity [h, w] of the liquid alone.
 
@@ -125,13 +129,17 @@ def composite(
     in one order of depth with the liquid's (Eq. rendering); without them the liquid lies in front. modes: the tiles
     in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall,
     which the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same.
-    Not both frozen and wall. The opacity is "obtained by rasterizing G^fg alone" (supplement).
+    glass: Gaussians that are no liquid, drawn in one order of depth with the liquid's.
+    Only one of frozen, wall and glass. The opacity is "obtained by rasterizing G^fg alone" (supplement).
     """
     shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
     colors = children.colors.flatten(0, 1)
     image: Tensor
     alpha: Tensor
-    if frozen is None and wall is not None:
+    if glass is not None:
+        assert frozen is None and wall is None
+        image, alpha = _with_glass(shapes, colors, camera, background, glass)
+    elif frozen is None and wall is not None:
         image, alpha = _behind_wall(shapes, colors, camera, background, wall, in_front)
     elif frozen is None:
         image, alpha = rasterize(*shapes, colors, camera, background=background)
@@ -139,6 +147,18 @@ def composite(
         image, _ = rasterize(*shapes, colors, camera, background=background, frozen=frozen, modes=modes)
         _, alpha = rasterize(*shapes, None, camera)
     return image, alpha
+
+
+def _with_glass(
+    shapes: tuple[Tensor, Tensor, Tensor], colors: Tensor, camera: Camera, background: Tensor, glass: Splats
+) -> tuple[Tensor, Tensor]:
+    """`composite` where glass stands before the liquid: its share of each pixel is a channel of its own."""
+    theirs = glass.means, glass.factors, glass.opacities
+    means, factors, opacities = (torch.cat(pair) for pair in zip(shapes, theirs))
+    parts = [torch.cat([c, c.new_full((len(c), 1), is_liquid)], 1) for c, is_liquid in ((colors, 1), (glass.colors, 0))]
+    behind = torch.cat([background, background.new_zeros(*background.shape[:-1], 1)], -1)
+    drawn, _ = rasterize(means, factors, opacities, torch.cat(parts), camera, background=behind)
+    return drawn[..., :3], drawn[..., 3]
 
 
 def _behind_wall(
@@ -184,9 +204,12 @@ def image_loss(
     """
     foreground, gradient, silhouette = window_losses(image, alpha, photograph)
     loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / area
-    if ssim_weight > 0:
+    if ssim_weight > 0 or weights.beside > 0:
         truth = photograph.image.to(torch.float32) / 255
-        loss = loss + ssim_weight * losses.ssim_loss(image[photograph.box], truth)
+        if ssim_weight > 0:
+            loss = loss + ssim_weight * losses.ssim_loss(image[photograph.box], truth)
+        if weights.beside > 0:
+            loss = loss + weights.beside * losses.beside_loss(image[photograph.box], truth, photograph.mask)
     return loss
 
 
@@ -218,6 +241,9 @@ def fit_appearance(
 
     Raises SplashbenchError where the loss stops being finite.
     """
+    glass = None if appearance.glass is None else GlassFit(appearance.glass, track.grid.voxel)
+    if glass is None:
+        settings = replace(settings, weights=replace(settings.weights, beside=0.0))
     carriers = ActiveCarriers(track, color_cell)
     decoder = appearance.decoder
     parameters = list(decoder.parameters())
@@ -244,8 +270,16 @@ def fit_appearance(
             schedule = adaptive
 
     def shown(children: Children, target: TrainingTarget, active: Active) -> tuple[Tensor, Tensor]:
+        before = None if glass is None else glass.glass.seen(target.eye)
         return composite(
-            children, target.camera, target.background, target.frozen, target.modes, target.wall, active.in_front
+            children,
+            target.camera,
+            target.background,
+            target.frozen,
+            target.modes,
+            target.wall,
+            active.in_front,
+            before,
         )
 
     def seen(
@@ -282,7 +316,8 @@ def fit_appearance(
 
     @torch.no_grad()
     def state() -> tuple[Appearance, np.ndarray]:
-        return Appearance(features.all(), appearance.log_scales, decoder), carriers.left(track.carriers.count)
+        look = Appearance(features.all(), appearance.log_scales, decoder, appearance.glass)
+        return look, carriers.left(track.carriers.count)
 
     def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
         """`target` in the size that it has at `iteration`."""
@@ -334,19 +369,24 @@ def fit_appearance(
             raise SplashbenchError(
                 f"the loss of splashsplat is {history[-1]} at iteration {iteration + 1}; lower the learning rates"
             )
-        by_feature, by_scale, *by_head = torch.autograd.grad(loss, [*values, *parameters])
-        for parameter, gradient in zip(parameters, by_head):
+        panes = [] if glass is None else glass.parameters
+        by_feature, by_scale, *others = torch.autograd.grad(loss, [*values, *parameters, *panes])
+        for parameter, gradient in zip(parameters, others):
             parameter.grad = gradient
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
         features.step(target.frame, by_feature, factor, active.places)
         scales.step(active.ids, by_scale, factor)
+        if glass is not None:
+            glass.step(others[len(parameters) :], factor)
         iteration += 1
         progress(schedule.done(iteration))
         if offer is not None and iteration >= shown_from:
             offer(state, False)
     reader.close()
+    if glass is not None:
+        glass.done()
     appearance.features = features.all()
     return Fit(history, carriers.left(track.carriers.count))
 

@@ -19,7 +19,7 @@ SEPARATION_MARGIN = 0.6
 
 @dataclass(frozen=True)
 class LossWeights:
-    """The paper's lambdas."""
+    """The paper's lambdas; and `beside`, of what photographs show beside the mask where there is glass (glass.py)."""
 
     foreground: float = 0.5
     gradient: float = 0.1
@@ -28,11 +28,18 @@ class LossWeights:
     covariance: float = 0.01
     separation: float = 0.1
     color: float = 1.0
+    beside: float = 0.0
 
 
 def foreground_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """L1 over the mask's pixels, normalised by their number (Eq. foreground_loss)."""
     return ((image - target).abs() * mask[..., None]).sum() / (3 * mask.sum() + EPSILON)
+
+
+def beside_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """L1 over the pixels beside the mask (bool), normalised by their number. Not in the paper."""
+    beside = ~mask
+    return ((image - target).abs() * beside[..., None]).sum() / (3 * beside.sum() + EPSILON)
 
 
 def gradient_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
