@@ -137,7 +137,8 @@ def composite(
     image: Tensor
     alpha: Tensor
     if glass is not None:
-        assert frozen is None and wall is None
+        assert frozen is None
+        assert wall is None
         image, alpha = _with_glass(shapes, colors, camera, background, glass)
     elif frozen is None and wall is not None:
         image, alpha = _behind_wall(shapes, colors, camera, background, wall, in_front)

@@ -82,7 +82,9 @@ def track(phi: float) -> Track:
         2,
     )
     grid = Grid(np.array([1.0, 2.0, 3.0]), 0.5, (12, 12, 12))
-    return Track(grid, carriers, Motion(np.zeros((0, 7, 7, 7, 3), np.float32), 2, []), np.zeros((1, 12, 12, 12), np.int8))
+    return Track(
+        grid, carriers, Motion(np.zeros((0, 7, 7, 7, 3), np.float32), 2, []), np.zeros((1, 12, 12, 12), np.int8)
+    )
 
 
 def test_it_begins_about_the_surface_the_same_for_the_same_seed() -> None:
