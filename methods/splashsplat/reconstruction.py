@@ -233,6 +233,7 @@ def _fit_appearance(
     # Gaussians of the background that are drawn together with the liquid's are prepared for one size.
     longest = max(max(camera.width, camera.height) for camera in scene.cameras.values())
     coarse = frozen is None and config.coarse_share > 0 and longest > config.coarse_side
+    memory.give_back()
     targets = collect_targets(
         scene,
         backgrounds,
@@ -257,7 +258,8 @@ def _fit_appearance(
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
     if config.first_look:
-        take_on(photographed(track, targets), appearance.features, appearance.decoder)
+        looked_at = [target.coarse or target for target in targets]
+        take_on(photographed(track, looked_at), appearance.features, appearance.decoder)
     color_cell = observations.hull_grid.voxel / voxel
 
     def settle() -> None:

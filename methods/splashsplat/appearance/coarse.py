@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from splashbench.parallel import each
 from splashbench.scene.camera import Camera
 
 from ..kernel.window_loss import WindowPhotograph
-from .photographs import read_now
+from .photographs import Deferred, Photograph, Shelf, read_now
 from .targets import TrainingTarget, windowed
 
 
@@ -28,13 +30,21 @@ def with_half_size(
     """Give each target its `coarse` one, in place.
 
     backgrounds: float32 [H, W, 3] or [3] by view; walls: float32 [H, W] or None by view; of whole images, which the
-    targets' windows are parts of and begin at even pixels of. They are halved once each, and shared.
+    targets' windows are parts of and begin at even pixels of. They are halved once each, and shared. Photographs are
+    kept as far as there is room.
     """
     behind = {name: _halved(torch.from_numpy(image)) for name, image in backgrounds.items()}
     before = {name: None if wall is None else _halved(torch.from_numpy(wall)) for name, wall in walls.items()}
-    for target in targets:
+    shelf = Shelf()
+
+    def halve(target: TrainingTarget) -> None:
+        later = Deferred(partial(_read_halved, target.photograph))
+        photograph = later if shelf.full else shelf.keep(later.read())
         name = target.camera.name
-        target.coarse = half_size(target, behind[name], before[name])
+        target.coarse = half_size(target, photograph, behind[name], before[name])
+
+    # Most of the time goes into reading photographs.
+    each(halve, targets)
 
 
 def set_half_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
@@ -47,32 +57,48 @@ def set_half_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str
             target.coarse.background = windowed(behind[target.camera.name], corner, target.coarse.camera)
 
 
-def half_size(target: TrainingTarget, background: Tensor, wall: Tensor | None) -> TrainingTarget:
-    """`target` with pixels twice as wide and high; a coarse pixel is liquid where half of it or more is.
+def half_size(
+    target: TrainingTarget, photograph: Photograph, background: Tensor, wall: Tensor | None
+) -> TrainingTarget:
+    """`target` with pixels twice as wide and high.
 
-    background, wall: of the whole image at that size, or [3] and None.
+    photograph: of that size, see `halved_photograph`. background, wall: of the whole image at that size, or [3] and
+    None.
     """
-    photograph, camera = read_now(target.photograph), _half(target.camera)
-    rows, columns = photograph.mask.shape
-    top, left = photograph.top % 2, photograph.left % 2
-    # Coarse pixels begin at even ones of the window; what is added at the edges repeats them, and is no liquid.
-    edges = (left, (left + columns) % 2, top, (top + rows) % 2)
-    image = _mean(_padded(photograph.image.to(torch.float32), edges))
-    covered = _mean(pad(photograph.mask.to(torch.float32), edges)[..., None])[..., 0]
+    camera = _half(target.camera)
     x, y = (at // 2 for at in target.corner)
     window = slice(y, y + camera.height), slice(x, x + camera.width)
     return replace(
         target,
         camera=camera,
-        photograph=WindowPhotograph(
-            image.round().to(torch.uint8).contiguous(),
-            (covered >= 0.5).contiguous(),
-            top=photograph.top // 2,
-            left=photograph.left // 2,
-        ),
+        photograph=photograph,
         background=background if background.ndim == 1 else background[window],
         area=target.area / 4,
         wall=None if wall is None else wall[window],
+    )
+
+
+def _read_halved(photograph: Photograph) -> WindowPhotograph:
+    return halved_photograph(read_now(photograph))
+
+
+def halved_photograph(photograph: WindowPhotograph) -> WindowPhotograph:
+    """`photograph` with pixels twice as wide and high; a coarse pixel is liquid where half of it or more is."""
+    rows, columns = photograph.mask.shape
+    top, left = photograph.top % 2, photograph.left % 2
+    # Coarse pixels begin at even ones of the window; what is added at the edges repeats them, and is no liquid.
+    added = (top, (top + rows) % 2), (left, (left + columns) % 2)
+    image = np.pad(photograph.image.numpy(), (*added, (0, 0)), mode="edge").astype(np.uint16)
+    sums = image[0::2, 0::2] + image[0::2, 1::2] + image[1::2, 0::2] + image[1::2, 1::2]
+    # A quarter, rounded; halves to the even number.
+    means = (sums + 1 + (sums >> 2 & 1)) >> 2
+    mask = np.pad(photograph.mask.numpy(), added).astype(np.uint8)
+    covered = mask[0::2, 0::2] + mask[0::2, 1::2] + mask[1::2, 0::2] + mask[1::2, 1::2]
+    return WindowPhotograph(
+        torch.from_numpy(means.astype(np.uint8)),
+        torch.from_numpy(covered >= 2),
+        top=photograph.top // 2,
+        left=photograph.left // 2,
     )
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from splashbench.errors import SplashbenchError
+from splashbench.native import memory
 from splashbench.render import Frozen, rasterize
 from splashbench.scene.camera import Camera
 
@@ -45,6 +46,8 @@ _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
 # then opacities say little.
 _FOCUSINGS = (0.2, 0.4, 0.6, 0.8)
 _SEEN_BEFORE = 4
+# After so many iterations, and after each that drew so many pixels, what the heap holds of freed images is given back.
+_GIVE_BACK_EVERY, _GIVE_BACK_PIXELS = 25, 1 << 20
 # Share of the photographs that were seen before a state is shown. On opaque_bowl it is better than the draft then, in
 # glass it is a decibel below for some seconds.
 _SHOWN_FROM = 0.25
@@ -382,6 +385,8 @@ def fit_appearance(
         if glass is not None:
             glass.step(others[len(parameters) :], factor)
         iteration += 1
+        if iteration % _GIVE_BACK_EVERY == 0 or alpha.numel() >= _GIVE_BACK_PIXELS:
+            memory.give_back()
         progress(schedule.done(iteration))
         if offer is not None and iteration >= shown_from:
             offer(state, False)

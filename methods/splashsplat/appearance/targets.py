@@ -23,7 +23,7 @@ from splashbench.scene.scene import TrainingScene
 
 from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import WindowPhotograph
-from .photographs import Deferred, Photograph, Shelf
+from .photographs import KEPT_BYTES, Deferred, Photograph, Shelf
 
 SilhouetteNorm = Literal["image", "window", "mask"]
 
@@ -166,7 +166,8 @@ def collect_targets(
     over the "mask". even: windows begin at even pixels, so that half-size ones are parts of half-size images.
     """
     frozen = frozen or {}
-    shelf = Shelf()
+    # Half-size photographs stand for these in most of the fit.
+    shelf = Shelf(0 if even else KEPT_BYTES)
     targets = []
     for view, name in enumerate(scene.train):
         camera = scene.cameras[name]

@@ -5,7 +5,12 @@ import pytest
 import torch
 
 from splashbench.scene.camera import Camera, look_at
-from splashbench_methods.splashsplat.appearance.coarse import set_half_backgrounds, with_half_size
+from splashbench_methods.splashsplat.appearance import coarse as coarse_module
+from splashbench_methods.splashsplat.appearance.coarse import (
+    halved_photograph,
+    set_half_backgrounds,
+    with_half_size,
+)
 from splashbench_methods.splashsplat.appearance.photographs import Deferred, ReadAhead, Shelf, read_now
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
@@ -159,3 +164,27 @@ def test_a_colour_behind_everything_stays_one() -> None:
     assert made.coarse is not None
     assert made.coarse.background.tolist() == pytest.approx([0.1, 0.2, 0.3])
     assert made.coarse.wall is None
+
+
+def test_a_coarse_pixel_is_the_rounded_mean_of_four() -> None:
+    rng = np.random.default_rng(4)
+    pixels = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    mask = rng.random((64, 64)) < 0.5
+    found = halved_photograph(WindowPhotograph(torch.from_numpy(pixels), torch.from_numpy(mask), top=2, left=4))
+    blocks = pixels.astype(float).reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_array_equal(found.image.numpy(), np.round(blocks))
+    np.testing.assert_array_equal(found.mask.numpy(), mask.reshape(32, 2, 32, 2).sum(axis=(1, 3)) >= 2)
+    assert (found.top, found.left) == (1, 2)
+
+
+def test_coarse_photographs_beyond_the_room_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = halved(target()).photograph
+    monkeypatch.setattr(coarse_module, "Shelf", lambda: Shelf(room=0))
+    later = halved(target()).photograph
+    assert isinstance(kept, WindowPhotograph)
+    assert isinstance(later, Deferred)
+    for _ in range(2):
+        again = read_now(later)
+        assert torch.equal(again.image, kept.image)
+        assert torch.equal(again.mask, kept.mask)
+        assert (again.top, again.left) == (kept.top, kept.left)
