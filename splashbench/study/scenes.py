@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from filelock import FileLock
+from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_json, write_json, write_model, write_png
@@ -22,7 +23,7 @@ from splashbench.scene import Camera, Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
 from splashbench.scene.layout import plain_name
 from splashbench.scene.source import ReleasedSource
-from splashbench.study.perturbations import Dice, Perturbation, Recording, perturbed
+from splashbench.study.perturbations import Dice, Recording, perturbed
 from splashbench.study.spec import StudyVariant
 from splashbench.study.thinning import recorded
 from splashbench.study.view_subsets import nested_views
@@ -68,9 +69,14 @@ def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -
     with FileLock(place.parent.with_suffix(".lock")):
         if not place.exists():
             with atomic_directory(place) as staging:
-                _copy(scene, changed.get("train_views", list(scene.train)), staging)
-                if variant.perturbation:
-                    _perturb(Scene.open(staging), scene, variant.perturbation, seed)
+                train = changed.get("train_views", list(scene.train))
+                if not variant.perturbation:
+                    _copy(scene, train, staging)
+                else:
+                    recording = recording_of(scene, train)
+                    worse = perturbed(recording, variant.perturbation, Dice(seed, scene.name))
+                    _copy(scene, list(worse.views), staging)
+                    _perturb(Scene.open(staging), scene, recording, worse)
     return Scene.open(place)
 
 
@@ -136,12 +142,14 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _perturb(copy: Scene, scene: Scene, steps: tuple[Perturbation, ...], seed: int) -> None:
-    """Replace what the training views of `copy` are told and shown by something worse; the same for the same seed."""
-    recording = recording_of(scene, copy.train)
-    worse = perturbed(recording, steps, Dice(seed, scene.name))
+def _perturb(copy: Scene, scene: Scene, recording: Recording, worse: Recording) -> None:
+    """Replace what the training views of `copy`, those of `worse`, are told and shown by what `worse` has.
+
+    recording: shows `scene` as it is; what `worse` shares with it stays.
+    """
     if worse.cameras is not recording.cameras:
         _write_cameras(copy, worse.cameras)
+    _write_setup(copy, recording, worse)
     paths: dict[tuple[str, int], str] = {}
     for name in copy.train:
         for t in range(scene.n_frames):
@@ -184,7 +192,30 @@ def recording_of(scene: Scene, views: Sequence[str] | None = None) -> Recording:
         finest=1 / every,
         metres_per_unit=None if scene.meta is None else scene.meta.metres_per_unit,
         container_mask=scene.container_mask,
+        gravity=scene.gravity,
+        container_pose=_container_pose(scene),
     )
+
+
+def _container_pose(scene: Scene) -> NDArray[np.float64] | None:
+    """Mesh to scene, 4x4; None where there is no mesh."""
+    if scene.meta is None or scene.meta.container_mesh is None:
+        return None
+    pose = scene.meta.container_pose
+    return np.eye(4) if pose is None else np.array(pose, dtype=np.float64)
+
+
+def _write_setup(copy: Scene, recording: Recording, worse: Recording) -> None:
+    """What scene.json states of gravity and the container's place."""
+    stated = {
+        key: getattr(worse, key).tolist()
+        for key in ("gravity", "container_pose")
+        if getattr(worse, key) is not getattr(recording, key)
+    }
+    if stated and copy.meta is not None:
+        path = copy.directory / "scene.json"
+        path.unlink()  # it may be a link to the scene's own
+        write_model(path, SceneMeta.model_validate(copy.meta.model_dump() | stated))
 
 
 def _write_cameras(copy: Scene, cameras: Mapping[str, Camera]) -> None:

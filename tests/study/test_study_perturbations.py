@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
@@ -53,6 +55,7 @@ from splashbench.study.perturbations.masks import (
     HoledMasks,
     WrongMasks,
 )
+from splashbench.study.perturbations.setup import ContainerMisplaced, GravityError, MissingCameras
 from splashbench.study.scenes import changed_scene, recording_of
 from splashbench.study.spec import StudyVariant
 from splashbench.study.thinning import thinned
@@ -74,13 +77,28 @@ def picture(name: str, t: float) -> np.ndarray:
     return np.stack([grey, grey, np.full_like(grey, 16 * t)], axis=-1).astype(np.uint8)
 
 
-def recording(finest: float = 0.0625) -> Recording:
+def recording(finest: float = 0.0625, names: str = "1234") -> Recording:
     intrinsics = np.array([[90.0, 0, 48], [0, 90, 32], [0, 0, 1]])
     cameras = {}
-    for name in "1234":
+    for name in names:
         eye = 3 * np.array([np.cos(int(name)), 0.4, np.sin(int(name))])
         cameras[name] = Camera(name, WIDTH, HEIGHT, intrinsics, look_at(eye))
-    return Recording(cameras, FRAMES, 0.032, picture, disc, finest, metres_per_unit=0.1)
+    return Recording(
+        cameras,
+        FRAMES,
+        0.032,
+        picture,
+        disc,
+        finest,
+        metres_per_unit=0.1,
+        gravity=np.array([0.0, -1.0, 0.0]),
+        container_pose=np.eye(4),
+    )
+
+
+def recording_for(kind: type[Step]) -> Recording:
+    """One that can have `kind` at all severities."""
+    return recording(names="1234567" if kind is MissingCameras else "1234")
 
 
 def time_shown(worse: Recording, name: str, t: float) -> float:
@@ -94,7 +112,15 @@ def severities(kind: type[Step]) -> list[Step]:
 def harm(worse: Recording, given: Recording) -> float:
     """Some measure of all that differs."""
     total = 0.0
+    assert given.gravity is not None
+    assert given.container_pose is not None
+    assert worse.gravity is not None
+    assert worse.container_pose is not None
+    total += np.abs(worse.gravity - given.gravity).sum() + np.abs(worse.container_pose - given.container_pose).sum()
     for name in given.views:
+        if name not in worse.views:
+            total += 1.0
+            continue
         total += np.abs(worse.cameras[name].K - given.cameras[name].K).sum()
         total += np.linalg.norm(worse.cameras[name].w2c - given.cameras[name].w2c) * 100
         for t in range(FRAMES):
@@ -105,7 +131,7 @@ def harm(worse: Recording, given: Recording) -> float:
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.named())
 def test_every_kind_has_five_severities_each_worse_than_the_last(kind: type[Step]) -> None:
-    given, steps = recording(), severities(kind)
+    given, steps = recording_for(kind), severities(kind)
     assert len(steps) == 5
     assert kind.unit
     assert kind.__doc__
@@ -119,7 +145,10 @@ def test_every_kind_has_five_severities_each_worse_than_the_last(kind: type[Step
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.named())
 def test_a_seed_decides_all_and_pictures_may_be_asked_for_in_any_order(kind: type[Step]) -> None:
     step = severities(kind)[3]
-    first, second = (perturbed(recording(), [step], DICE) for _ in range(2))
+    first, second = (perturbed(recording_for(kind), [step], DICE) for _ in range(2))
+    assert first.views == second.views
+    np.testing.assert_array_equal(first.gravity, second.gravity)
+    np.testing.assert_array_equal(first.container_pose, second.container_pose)
     forward = [first.image(name, t) for name in first.views for t in range(FRAMES)]
     masks = [first.mask(name, t) for name in first.views for t in range(FRAMES)]
     for name in reversed(second.views):
@@ -414,12 +443,42 @@ def test_a_scene_that_names_another_as_its_own_recording_is_refused(every: int, 
         recording_of(Scene.open(balls_copy))
 
 
+def test_of_missing_cameras_fewer_are_among_more_and_two_are_left() -> None:
+    given = recording(names="1234567")
+    left = [set(perturbed(given, [MissingCameras(amount=n)], DICE).views) for n in range(6)]
+    assert [len(views) for views in left] == [7, 6, 5, 4, 3, 2]
+    assert all(more > fewer for more, fewer in pairwise(left))
+    with pytest.raises(SplashbenchError, match="missing_cameras takes 6 of 7 training views, and 2 have to be left"):
+        perturbed(given, [MissingCameras(amount=6)], DICE)
+
+
+def test_gravity_is_stated_that_many_degrees_beside_itself() -> None:
+    for amount in (1.0, 20.0, 90.0):
+        stated = perturbed(recording(), [GravityError(amount=amount)], DICE).gravity
+        assert stated is not None
+        assert np.linalg.norm(stated) == pytest.approx(1)
+        assert np.degrees(np.arccos(-stated[1])) == pytest.approx(amount)
+    with pytest.raises(SplashbenchError, match="states gravity"):
+        perturbed(replace(recording(), gravity=None), [GravityError(amount=1)], DICE)
+
+
+def test_the_container_is_stated_that_far_away() -> None:
+    pose = perturbed(recording(), [ContainerMisplaced(amount=5)], DICE).container_pose
+    assert pose is not None
+    assert np.linalg.norm(pose[:3, 3]) == pytest.approx(0.05)  # .1 m a unit
+    angle = np.degrees(np.arccos((np.trace(pose[:3, :3]) - 1) / 2))
+    assert angle == pytest.approx(0.5)
+    for lacking in ({"container_pose": None}, {"metres_per_unit": None}):
+        with pytest.raises(SplashbenchError, match="container_misplaced"):
+            perturbed(replace(recording(), **lacking), [ContainerMisplaced(amount=5)], DICE)
+
+
 def test_nothing_is_read_before_it_is_asked_for() -> None:
     def never(name: str, t: float) -> np.ndarray:
         raise AssertionError("read too early")
 
-    given = replace(recording(), image=never, mask=never)
     for kind in KINDS:
+        given = replace(recording_for(kind), image=never, mask=never)
         for step in severities(kind):
             perturbed(given, [step], DICE)
 
@@ -462,6 +521,35 @@ def test_a_copy_differs_in_what_is_said_alone(step: dict, balls: Scene, tmp_path
     }
     assert {what for what, count in touched.items() if count} == expected[step["kind"]]
     assert Scene.open(balls.directory).digest == digest
+
+
+def test_a_copy_lacks_cameras_and_states_the_setup_wrongly(balls_copy: Path, tmp_path: Path) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(balls_copy / "box.ply")
+    path = balls_copy / "scene.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"container_mesh": "box.ply", "metres_per_unit": 1.0}))
+    scene, before = Scene.open(balls_copy), path.read_text()
+
+    def copied(*steps: dict) -> Scene:
+        return changed_scene(scene, StudyVariant.model_validate({"name": "v", "perturbation": steps}), 1, tmp_path)
+
+    fewer = copied({"kind": "missing_cameras", "amount": 2}, {"kind": "exposure", "amount": 1.0})
+    assert check_scene(fewer.directory) == []
+    assert len(fewer.train) == len(scene.train) - 2
+    assert set(fewer.train) < set(scene.train)
+    assert fewer.test == scene.test
+    assert not np.array_equal(fewer.image(fewer.train[0], 0), scene.image(fewer.train[0], 0))
+    for name in fewer.train:
+        np.testing.assert_array_equal(fewer.cameras[name].w2c, scene.cameras[name].w2c)
+    tilted = copied({"kind": "gravity_error", "amount": 10})
+    assert check_scene(tilted.directory) == []
+    assert float(tilted.gravity @ scene.gravity) == pytest.approx(np.cos(np.radians(10)))
+    moved = copied({"kind": "container_misplaced", "amount": 20})
+    assert check_scene(moved.directory) == []
+    mesh, other = scene.container_mesh(), moved.container_mesh()
+    assert mesh is not None
+    assert other is not None
+    assert np.linalg.norm((other.vertices - mesh.vertices).mean(axis=0)) == pytest.approx(0.02, rel=0.01)
+    assert path.read_text() == before
 
 
 def test_what_a_scene_cannot_have_is_told(balls: Scene, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What can be wrong with a recording, in physical units: masks, photographs, cameras, clocks (docs/study.md)."""
+"""What can be wrong with a recording, in physical units: masks, photographs, cameras, clocks, setup (docs/study.md)."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from .masks import (
     with_shares,
 )
 from .recording import Dice, Recording, Step
+from .setup import ContainerMisplaced, GravityError, MissingCameras
 
 Perturbation = Annotated[
     EmptyMasks
@@ -54,6 +55,9 @@ Perturbation = Annotated[
     | PrincipalPointError
     | LensDistortion
     | CameraMoved
+    | MissingCameras
+    | GravityError
+    | ContainerMisplaced
     | Exposure
     | WhiteBalance
     | Gamma

@@ -16,15 +16,15 @@ from splashbench.scene import Camera
 from .recording import Dice, Recording, Step
 
 
-def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
+def direction(rng: np.random.Generator) -> NDArray[np.float64]:
     """A unit vector [3], evenly over all directions."""
     vector = rng.normal(size=3)
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _turn(rng: np.random.Generator, degrees: float) -> NDArray[np.float64]:
+def turn(rng: np.random.Generator, degrees: float) -> NDArray[np.float64]:
     """A rotation [3, 3] by `degrees` about a random axis."""
-    return np.asarray(cv2.Rodrigues(_direction(rng) * np.radians(degrees))[0])
+    return np.asarray(cv2.Rodrigues(direction(rng) * np.radians(degrees))[0])
 
 
 def _with_intrinsics(camera: Camera, change: NDArray[np.float64]) -> Camera:
@@ -45,7 +45,7 @@ class PoseRotation(Step):
     def applied(self, recording: Recording, dice: Dice) -> Recording:
         def change(camera: Camera) -> Camera:
             turned = camera.w2c.copy()
-            turned[:3, :3] = _turn(dice.of("axis", camera.name), self.amount) @ camera.w2c[:3, :3]
+            turned[:3, :3] = turn(dice.of("axis", camera.name), self.amount) @ camera.w2c[:3, :3]
             turned[:3, 3] = -turned[:3, :3] @ camera.center
             return replace(camera, w2c=turned)
 
@@ -68,7 +68,7 @@ class PoseTranslation(Step):
 
         def change(camera: Camera) -> Camera:
             moved = camera.w2c.copy()
-            away = self.amount / 1000 / scale * _direction(dice.of("direction", camera.name))
+            away = self.amount / 1000 / scale * direction(dice.of("direction", camera.name))
             moved[:3, 3] = -moved[:3, :3] @ (camera.center + away)
             return replace(camera, w2c=moved)
 
@@ -146,7 +146,7 @@ class CameraMoved(Step):
         chosen = str(rng.choice(recording.views))
         camera = recording.cameras[chosen]
         # About its centre, which changes a picture as a homography does, whatever is in it.
-        homography = camera.K @ _turn(rng, self.amount) @ np.linalg.inv(camera.K)
+        homography = camera.K @ turn(rng, self.amount) @ np.linalg.inv(camera.K)
         rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
         seen = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(homography).T
         place = tuple((seen[..., i] / seen[..., 2] - 0.5).astype(np.float32) for i in (0, 1))

@@ -25,7 +25,8 @@ class Recording:
 
     cameras: of each view, as a method is told. n_frames: timesteps. seconds: that one lasts. finest: timesteps between
     recorded frames: 1, or less where the recording has frames between. metres_per_unit: where it is known.
-    container_mask: bool [H, W] of a camera, or None.
+    container_mask: bool [H, W] of a camera, or None. gravity: unit vector [3], where it is stated. container_pose: 4x4,
+    mesh to scene, where there is a mesh in its place.
     """
 
     cameras: Mapping[str, Camera]
@@ -36,6 +37,8 @@ class Recording:
     finest: float = 1.0
     metres_per_unit: float | None = None
     container_mask: Callable[[str], NDArray[np.bool_] | None] = lambda name: None
+    gravity: NDArray[np.float64] | None = None
+    container_pose: NDArray[np.float64] | None = None
 
     @property
     def views(self) -> tuple[str, ...]:
