@@ -83,11 +83,11 @@ def fit_liquid(
 ) -> Reconstruction:
     """Fit the appearance of the liquid of `scene`; returns it, and what hides it from cameras.
 
-    backgrounds: float32 [H, W, 3] of every training view, in [0, 1]; or [3] where `frozen` has the background's
-    Gaussians of every view, to be drawn together with the liquid's. span: the part of `run`'s progress this takes up.
-    offer: is given, after iterations of the appearance, what makes the reconstruction as if the fit ended there, and
-    whether there will be no other for a while. settled: where given, `backgrounds` are for the first iterations
-    (`plates_share`), and this gives those for the others.
+    backgrounds: float32 [H, W, 3] of every training view, in [0, 1], and emptied once there are others (`settled`); or
+    [3] where `frozen` has the background's Gaussians of every view, to be drawn together with the liquid's. span: the
+    part of `run`'s progress this takes up. offer: is given, after iterations of the appearance, what makes the
+    reconstruction as if the fit ended there, and whether there will be no other for a while. settled: where given,
+    `backgrounds` are for the first iterations (`plates_share`), and this gives those for the others.
     """
     config, observations, carriers = traced.config, traced.observations, traced.carriers
     motion, packed = traced.motion, traced.packed
@@ -267,6 +267,7 @@ def _fit_appearance(
             behind = settled()
             set_backgrounds(targets, behind)
             set_half_backgrounds(targets, behind)
+            backgrounds.clear()  # nobody needs those of before, which are large
 
     fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle)
     return appearance, fit.left

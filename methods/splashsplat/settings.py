@@ -420,6 +420,6 @@ class SplashSplatConfig(MethodConfig):
                 covariance=self.covariance_weight,
                 separation=self.separation_weight,
                 color=self.color_weight,
-                beside=self.beside_weight,
+                beside=self.beside_weight if self.glass > 0 else 0.0,
             ),
         )

@@ -44,8 +44,6 @@ class ActiveCarriers:
         self._track = track
         frames = range(track.carriers.n_frames)
         self.ids = [track.ids(t) for t in frames]
-        # Kept for the frames alone: a state for every photograph would be a gigabyte on large scenes.
-        self._states = [track.state(t) for t in frames]
         self._cells = [_cells(track, t, color_cell) for t in frames]
         # Of each frame's carriers in the track those that are left; None for all.
         self._left: list[Tensor | None] = [None for _ in frames]
@@ -55,9 +53,9 @@ class ActiveCarriers:
     def of(self, target: TrainingTarget) -> Active:
         """What `target` teaches."""
         t = target.frame
-        state, left = self._states[t], self._left[t]
-        if target.fraction:
-            state = _part(self._track.state(t, target.fraction), left)
+        left = self._left[t]
+        # Made anew each time: states of all frames would hold hundreds of megabytes on large scenes.
+        state = _part(self._track.state(t, target.fraction), left)
         places, visibility = None, None
         shown = self._shown(target)
         if shown is not None:
@@ -111,7 +109,6 @@ class ActiveCarriers:
             before = self._left[t]
             self._left[t] = left if before is None else before.index_select(0, left)
             self.ids[t] = ids.index_select(0, left)
-            self._states[t] = _part(self._states[t], left)
             self._cells[t] = self._cells[t].index_select(0, left)
 
 

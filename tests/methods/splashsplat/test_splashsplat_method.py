@@ -284,7 +284,7 @@ def test_the_paper_preset_is_the_papers():
     assert control_shape((96, 37, 53), paper.motion.factor((96, 37, 53))) == (24, 24, 24)
     assert (paper.iterations, paper.learning_rate_features, paper.learning_rate_heads) == (3000, 2e-3, 2e-3)
     weights = paper.optimisation.weights
-    assert tuple(vars(weights).values()) == (0.5, 0.1, 0.2, 0.7, 0.01, 0.1, 1.0)
+    assert tuple(vars(weights).values()) == (0.5, 0.1, 0.2, 0.7, 0.01, 0.1, 1.0, 0.0)  # the last is not the paper's
     velocity = paper.motion.velocity
     assert (velocity.steps, velocity.step_size, velocity.band, velocity.limit) == (35, 0.45, 4.0, 8.0)
     assert (velocity.smooth, velocity.smoothing, velocity.smoothing_unit) == ("field", 0.6, "transport")
