@@ -258,8 +258,7 @@ def _fit_appearance(
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
     if config.first_look:
-        looked_at = [target.coarse or target for target in targets]
-        take_on(photographed(track, looked_at), appearance.features, appearance.decoder)
+        take_on(photographed(track, targets), appearance.features, appearance.decoder)
     color_cell = observations.hull_grid.voxel / voxel
 
     def settle() -> None:

@@ -15,7 +15,7 @@ import torch
 
 from ..carriers.subframe import Track
 from .decoder import Decoder
-from .photographs import read_now
+from .photographs import ReadAhead
 from .targets import HIDDEN, TrainingTarget
 
 # How far behind the nearest carrier of a pixel another one is still seen, transport voxels.
@@ -55,8 +55,11 @@ def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
     sums = np.zeros((track.carriers.count, 7))
     weights, sums_of_colors, sums_of_squares = sums[:, 0], sums[:, 1:4], sums[:, 4:]
     reach = _SEEN_WITHIN * track.grid.voxel
-    for target in targets:
-        photograph = read_now(target.photograph)
+    reader = ReadAhead()
+    for target, following in zip(targets, [*targets[1:], None]):
+        photograph = reader.get(target.photograph)
+        if following is not None:
+            reader.prepare(following.photograph)
         mask = photograph.mask.numpy()
         pixels, depth = target.camera.project(track.state(target.frame, target.fraction).positions.numpy())
         ids = track.ids(target.frame).numpy()
@@ -75,6 +78,7 @@ def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
         weights[ids] += weight
         sums_of_colors[ids] += weight[:, None] * colors
         sums_of_squares[ids] += weight[:, None] * colors**2
+    reader.close()
     known = weights > 0
     total = np.maximum(weights, 1e-9)[:, None]
     mean = sums_of_colors.sum(axis=0) / weights.sum() if known.any() else np.full(3, 0.5)
