@@ -45,6 +45,8 @@ Reconstruction = tuple[Liquid, LiquidOcclusion | None]
 
 # A carrier is seen through at most this many shells of liquid.
 _SEEN_THROUGH = 1.5
+# Pixels along the longer side of the images for which the setting `glass` is meant.
+_GLASS_SIDE = 240
 
 
 @dataclass(frozen=True)
@@ -254,7 +256,8 @@ def _fit_appearance(
         with_half_size(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
     memory.give_back()
     if observations.in_transparent_container and frozen is None:
-        appearance.glass = glass_before(track, config.glass, seed)
+        # Edges have so many more pixels along them.
+        appearance.glass = glass_before(track, round(config.glass * longest / _GLASS_SIDE), seed)
     if not targets:
         return appearance, np.ones(track.carriers.count, dtype=bool)
     if config.first_look:

@@ -164,7 +164,8 @@ class SplashSplatConfig(MethodConfig):
     color_weight: float = Field(1.0, ge=0)
     #: of what photographs show beside the liquid, where there is `glass`
     beside_weight: float = Field(0.4, ge=0)
-    #: Gaussians of a transparent container before the liquid, to begin with; 0 for none
+    #: Gaussians of a transparent container before the liquid, to begin with, where images have 240 pixels along the
+    #: longer side; more in proportion where they have more; 0 for none
     glass: int = Field(4000, ge=0, le=100_000)
     #: carriers whose learned opacity falls below this are dropped, eight times during the fit and at its end; 0 keeps
     #: all
