@@ -252,6 +252,7 @@ class SplashSplatConfig(MethodConfig):
             "coarse_share": 0.0,
             "plates_share": 0.0,
             "glass": 0,
+            "beside_weight": 0.0,
             "first_look": False,
             "background_preset": "paper",
             "draft_cells": 0,
@@ -421,6 +422,6 @@ class SplashSplatConfig(MethodConfig):
                 covariance=self.covariance_weight,
                 separation=self.separation_weight,
                 color=self.color_weight,
-                beside=self.beside_weight if self.glass > 0 else 0.0,
+                beside=self.beside_weight,
             ),
         )
