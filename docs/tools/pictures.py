@@ -32,6 +32,7 @@ from splashbench.score.result import Digests, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1
 from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
 from splashbench.study.perturbations.setup import MissingCameras
+from splashbench.study.perturbations.timesteps import FewerTimesteps
 from splashbench.study.scenes import recording_of
 from splashbench.submission import Submission
 from splashbench_methods.splashsplat.fields.container import known_container
@@ -250,7 +251,8 @@ def perturbations() -> list[Path]:
     figure = Figure(figsize=(12, 9.6), layout="constrained")
     panels = iter(figure.subplots(5, 6).flat)
     # What is missing or stated wrongly is in no photograph.
-    for kind in (None, *(kind for kind in KINDS if kind.__module__ != MissingCameras.__module__)):
+    unseen = MissingCameras.__module__, FewerTimesteps.__module__
+    for kind in (None, *(kind for kind in KINDS if kind.__module__ not in unseen)):
         worse = given if kind is None else _worse(given, kind, scene.name)
         title = "as it is" if kind is None else kind.named().replace("_", " ")
         name, t = _most_changed(given, worse)

@@ -180,7 +180,8 @@ class SplashSplat(Method):
             with run.stage("self-calibration"):
                 calibration = self_calibration(scene, plates, lambda what: run.progress(0, what))
             if calibration:
-                run.note("self-calibration", "; ".join(calibration.lines(scene.cameras)))
+                for number, line in enumerate(calibration.lines(scene.cameras), 1):
+                    run.note("self-calibration" if number == 1 else f"self-calibration, {number}", line)
                 scene, known = calibration.scene(scene), None
                 plates = cache(lambda: clean_plates(scene))
         deferred = config.plates_share > 0 and config.composition != "together"

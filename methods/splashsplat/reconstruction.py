@@ -19,7 +19,7 @@ from splashbench.render import Frozen
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene.scene import TrainingScene
 
-from .appearance.coarse import set_half_backgrounds, with_half_size
+from .appearance.coarse import HALVINGS, set_smaller_backgrounds, with_smaller
 from .appearance.first_look import photographed, take_on
 from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
 from .appearance.glass import glass_before
@@ -246,14 +246,14 @@ def _fit_appearance(
         hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
         cut=None if occlusion is None else lambda name, points: occlusion.cut(scene.cameras[name], points),
         frozen=frozen,
-        even=coarse,
+        blocks=2**HALVINGS if coarse else 1,
     )
     if coarse:
         nowhere = np.zeros((0, 3))
         cuts = {
             name: None if occlusion is None else occlusion.cut(scene.cameras[name], nowhere) for name in scene.train
         }
-        with_half_size(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
+        with_smaller(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
     memory.give_back()
     if observations.in_transparent_container and frozen is None:
         # Edges have so many more pixels along them.
@@ -268,7 +268,7 @@ def _fit_appearance(
         if settled is not None:
             behind = settled()
             set_backgrounds(targets, behind)
-            set_half_backgrounds(targets, behind)
+            set_smaller_backgrounds(targets, behind)
             backgrounds.clear()  # nobody needs those of before, which are large
 
     fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle)

@@ -37,7 +37,7 @@ _DRAFT_PLATES_SHARE = 0.25
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "15"
+VERSION = "16"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -175,7 +175,9 @@ class SplashSplatConfig(MethodConfig):
     #: carriers begin with the colours in which the photographs show them, or else at random as in the paper
     first_look: bool = True
     #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
-    coarse_share: float = Field(0.8, ge=0, le=1)
+    coarse_share: float = Field(0.9, ge=0, le=1)
+    #: share of the iterations, the first ones of these, that see them at a quarter
+    coarsest_share: float = Field(0.4, ge=0, le=1)
     #: pixels along the longest side beyond which photographs are large enough for that
     coarse_side: PositiveInt = 1500
     #: share of the iterations, the first ones, that have the footage's clean plates behind the liquid: the background
@@ -250,6 +252,7 @@ class SplashSplatConfig(MethodConfig):
             "prune_opacity": 0.0,
             "idle_share": 0.0,
             "coarse_share": 0.0,
+            "coarsest_share": 0.0,
             "plates_share": 0.0,
             "glass": 0,
             "beside_weight": 0.0,
@@ -413,6 +416,7 @@ class SplashSplatConfig(MethodConfig):
             prune_opacity=self.prune_opacity,
             idle_share=self.idle_share,
             coarse_share=self.coarse_share,
+            coarsest_share=self.coarsest_share,
             plates_share=self.plates_share,
             weights=LossWeights(
                 foreground=self.foreground_weight,

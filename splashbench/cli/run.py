@@ -47,8 +47,10 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     add_settings(parser, "a single setting on top of the preset; may be given several times")
     parser.add_argument(
         "--withhold",
-        choices=["odd"],
-        help="keep every second timestep from the method; these are rendered, and they alone are scored",
+        type=_which_timesteps,
+        metavar="WHICH",
+        help="keep timesteps from the method: `odd` ones, all but each third by `keep_1_of_3`, or a third at random by "
+        "`drop_33_percent`; these are rendered, and they alone are scored",
     )
     parser.add_argument(
         "--checkpoints",
@@ -56,6 +58,17 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         help="also keep the views of the fit on its way, after about 5, 7, 10, 14, 20 ... seconds of it",
     )
     add_run_options(parser)
+
+
+def _which_timesteps(text: str) -> str:
+    from splashbench.errors import SplashbenchError
+    from splashbench.submission.withheld import kept_timesteps
+
+    try:
+        kept_timesteps(3, text)
+    except SplashbenchError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def run(arguments: argparse.Namespace) -> int:

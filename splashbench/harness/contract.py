@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from splashbench.errors import SplashbenchError
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+from splashbench.submission.identity import MAX_NOTE
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -103,8 +104,12 @@ class Run:
         return 0.0 if self._checkpoints is None else self._checkpoints.spent
 
     def note(self, name: str, text: str) -> None:
-        """Write into record.json what the method found out by itself and went by, in a few words."""
-        self.notes[name] = text
+        """Write into record.json what the method found out by itself and went by, in a few words.
+
+        What is longer than `MAX_NOTE` characters goes on in notes called `name` 2, 3 and so on.
+        """
+        for number, start in enumerate(range(0, max(1, len(text)), MAX_NOTE), 1):
+            self.notes[name if number == 1 else f"{name} {number}"] = text[start : start + MAX_NOTE]
 
     @property
     def watched(self) -> bool:

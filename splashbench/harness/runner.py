@@ -24,7 +24,7 @@ from splashbench.harness.training_copy import make_training_copy
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission import IDENTITY, Checkpoint, Identity, Record, Status, Submission, identity_text, seal
-from splashbench.submission.withheld import Withheld, kept_timesteps
+from splashbench.submission.withheld import Withheld, kept_timesteps, scored_timesteps
 from splashbench.version import __version__
 
 #: Protocol v1: the frame rate is the median of at least this many renders.
@@ -70,6 +70,10 @@ def run_method(
     scene = Scene.open(scene_directory)
     if withheld and scene.n_frames < 3:
         raise SplashbenchError(f"{scene_directory} has {scene.n_frames} timesteps; to withhold some takes three")
+    if withheld and not scored_timesteps(scene.n_frames, withheld):
+        raise SplashbenchError(
+            f"{scene_directory} has {scene.n_frames} timesteps, and {withheld} leaves none between two that are seen"
+        )
     if name == EXTERNAL:
         raise SplashbenchError(
             "`external` is run by commands: splashbench run-external SCENE OUT --name ... --command ..."

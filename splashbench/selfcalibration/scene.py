@@ -1,4 +1,4 @@
-"""A scene as its own footage says that it was recorded: with other clocks, cameras and exposures than it was told."""
+"""A scene as its own footage says that it was recorded: with other clocks, cameras, exposures and masks than told."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from .cameras import FittedCameras, corrections, fit_cameras
 from .clocks import Offset, clock_offsets, droplets_of
 from .exposure import Response, responses
 from .features import find_tracks
+from .outlines import Outlines, outlines
 from .stance import Knock, find_knock
 
 Plates = Mapping[str, CleanPlate]
@@ -32,7 +33,8 @@ class SelfCalibration:
     """What was found to be other than told; empty where nothing was.
 
     offsets: of clocks. seconds_per_step: of a timestep. knocks: cameras that moved. cameras: as fitted, or None where
-    they are right. responses: of cameras that see light otherwise than most.
+    they are right. responses: of cameras that see light otherwise than most. outlines: of cameras whose masks are not
+    what their photographs show.
     """
 
     offsets: Mapping[str, Offset] = field(default_factory=dict)
@@ -40,9 +42,10 @@ class SelfCalibration:
     knocks: Mapping[str, Knock] = field(default_factory=dict)
     cameras: FittedCameras | None = None
     responses: Mapping[str, Response] = field(default_factory=dict)
+    outlines: Mapping[str, Outlines] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        return bool(self.offsets or self.knocks or self.cameras or self.responses)
+        return bool(self.offsets or self.knocks or self.cameras or self.responses or self.outlines)
 
     def lines(self, told: Mapping[str, Camera]) -> list[str]:
         """What was found, one line each, in words and units to act on. told: the cameras as they were told."""
@@ -65,6 +68,8 @@ class SelfCalibration:
             if response.contrast != 1.0:
                 told_of.append(f"contrast to the power of {response.contrast:.2f}")
             found.append(f"camera {name} sees light otherwise than most: {', '.join(told_of)}")
+        for name, outline in self.outlines.items():
+            found.append(f"camera {name}: {outline.line}")
         return found
 
     def scene(self, scene: TrainingScene) -> TrainingScene:
@@ -120,7 +125,8 @@ class CalibratedScene(TrainingScene):
         times = [(name, list(values)) for name, values in self.camera_times.items()]
         light = [(name, light.stops.tolist(), light.contrast) for name, light in self.found.responses.items()]
         knocks = [(name, knock.frame, knock.rotation.tolist()) for name, knock in self.found.knocks.items()]
-        return [cameras, times, light, knocks, self.found.cameras and self.found.cameras.distortion]
+        masks = [(name, outline.masks.digest) for name, outline in self.found.outlines.items()]
+        return [cameras, times, light, knocks, self.found.cameras and self.found.cameras.distortion, masks]
 
     def _straight(self) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Where each pixel of a straight photograph is in the distorted one."""
@@ -155,6 +161,9 @@ class CalibratedScene(TrainingScene):
 
     def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
         """Liquid mask [H, W] of a training camera at timestep `t`."""
+        outline = self.found.outlines.get(camera)
+        if outline is not None and t in outline.masks:
+            return outline.masks[t]
         return self._placed_mask(camera, t, self._told.mask(camera, t))
 
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
@@ -199,6 +208,11 @@ def self_calibration(
     found = replace(found, cameras=fit_cameras(tracks, scene.cameras))
     light = {name: response for name, response in responses(tracks, shown).items() if not response.is_standard}
     found = replace(found, responses=light)
+    told("comparing masks with photographs")
+    # Photographs that are moved or straightened are blurred by that, and droplets of few pixels look other than masks.
+    bent = found.cameras is not None and found.cameras.distortion != 0
+    sharp = [] if bent else [name for name in scene.train if name not in knocks]
+    found = replace(found, outlines=outlines(found.scene(scene), sharp))
     told("comparing clocks")
     right = found.scene(scene)
     own_times = any(not np.array_equal(times, scene.times) for times in scene.camera_times.values())

@@ -101,7 +101,7 @@ def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) ->
     return (
         (with_lpips and result.value("lpips") is None)
         or (run.timing_frames > 0 and result.value("render_fps") is None)
-        or (run.variant.withheld is not None and store.faded(entry) is None)
+        or (run.variant.unseen is not None and store.faded(entry) is None)
     )
 
 

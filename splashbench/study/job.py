@@ -160,7 +160,7 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
         keep_model=job.keep,
         replace=True,
         cache=store.cache / "parts",
-        withheld=job.variant.withheld,
+        withheld=job.variant.unseen,
     )
     if job.is_reference:
         reference = submission if submission.status == Status.OK else None
@@ -172,7 +172,7 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     saved, faded = result.save(store.results), None
     if job.picture and submission.status == Status.OK:
         _keep_picture(submission, scene, store.picture_path(job.digest))
-    if job.variant.withheld and submission.status == Status.OK:
+    if job.variant.unseen and submission.status == Status.OK:
         control = FadedSubmission(submission, scene)
         faded = score_submission(scene, control, reference, weights, fields=shared_fields(original)).save(store.results)
     if not job.keep and not job.is_reference:

@@ -164,7 +164,7 @@ def _reference(spec: StudySpec, scene: NamedScene, variant: StudyVariant, seed: 
     changed = changes(scene.scene, variant, seed) is not None
     row = StudyVariant(
         name=reference.method,
-        perturbation=variant.perturbation if changed else (),
+        perturbation=variant.harm if changed else (),
         train_views=variant.train_views if changed else None,
     )
     digest = _digest(method, preset, resolved, seed, "cpu", scene.scene, row)
@@ -189,6 +189,6 @@ def _digest(
         "scene": [scene.digest, changes(scene, variant, seed)],
         "protocol": PROTOCOL_V1.digest,
     }
-    if variant.withheld:  # only where timesteps are withheld: digests of earlier runs must not change
-        parts["withheld"] = variant.withheld
+    if variant.unseen:  # only where timesteps are withheld: digests of earlier runs must not change
+        parts["withheld"] = variant.unseen
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

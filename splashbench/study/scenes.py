@@ -43,8 +43,8 @@ def changes(scene: Scene, variant: StudyVariant, seed: int) -> dict[str, Any] | 
         train = nested_views(scene, views) if isinstance(views, int) else _named_views(scene, views)
         if train != scene.train:
             changed["train_views"] = list(train)
-    if variant.perturbation:
-        changed |= {"masks": [step.model_dump() for step in variant.perturbation], "seed": seed}
+    if variant.harm:
+        changed |= {"masks": [step.model_dump() for step in variant.harm], "seed": seed}
     return changed | {"version": _VERSION} if changed else None
 
 
@@ -70,11 +70,11 @@ def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -
         if not place.exists():
             with atomic_directory(place) as staging:
                 train = changed.get("train_views", list(scene.train))
-                if not variant.perturbation:
+                if not variant.harm:
                     _copy(scene, train, staging)
                 else:
                     recording = recording_of(scene, train)
-                    worse = perturbed(recording, variant.perturbation, Dice(seed, scene.name))
+                    worse = perturbed(recording, variant.harm, Dice(seed, scene.name))
                     _copy(scene, list(worse.views), staging)
                     _perturb(Scene.open(staging), scene, recording, worse)
     return Scene.open(place)

@@ -62,6 +62,27 @@ class StudyVariant(_Model):
     withheld: Withheld | None = None
     paper: str | None = None
 
+    @model_validator(mode="after")
+    def _withheld_once(self) -> StudyVariant:
+        if len(self._all_withheld) > 1:
+            raise ValueError(f"timesteps are withheld twice: {' and '.join(self._all_withheld)}")
+        return self
+
+    @property
+    def _all_withheld(self) -> list[str]:
+        of_steps = [step.withheld for step in self.perturbation]
+        return [which for which in (self.withheld, *of_steps) if which is not None]
+
+    @property
+    def unseen(self) -> Withheld | None:
+        """Timesteps that the method does not see, whether they are `withheld` or a step of the perturbation's."""
+        return next(iter(self._all_withheld), None)
+
+    @property
+    def harm(self) -> tuple[Perturbation, ...]:
+        """The steps of the perturbation that change what is seen."""
+        return tuple(step for step in self.perturbation if step.withheld is None)
+
 
 class Reference(_Model):
     """The control that dpsnr_bg is measured against, run on every scene and seed."""

@@ -175,7 +175,7 @@ def make_table(plan: StudyPlan, store: Store) -> Table:
     for variant in spec.variants:
         planned = [run for run in plan.runs if run.variant.name == variant.name]
         notes[variant.name], runs[variant.name] = variant.note, tuple(_study_run(run, store) for run in planned)
-        if variant.withheld:
+        if variant.unseen:
             name = variant.name + FADED
             notes[name], runs[name] = _FADED_NOTE, tuple(_study_run(run, store, faded=True) for run in planned)
     if plan.reference_row:

@@ -14,7 +14,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.scene import Scene
 from splashbench.submission.identity import Record
 from splashbench.submission.submission import Submission
-from splashbench.submission.withheld import scored_timesteps
+from splashbench.submission.withheld import scored_timesteps, seen_around
 
 #: Behind the method's name in identities and tables.
 FADED = "_faded"
@@ -41,17 +41,17 @@ class FadedSubmission:
         """sRGB uint8 [H, W, 3] of test view `camera` at timestep `t`."""
         if t not in self._faded:
             return self._submission.rendering(camera, t)
-        before, after = (self._submission.rendering(camera, t + side).astype(np.float64) for side in (-1, 1))
-        share = self._share(camera, t)
+        around, share = self._around(camera, t)
+        before, after = (self._submission.rendering(camera, seen).astype(np.float64) for seen in around)
         return np.round((1 - share) * before + share * after).astype(np.uint8)
 
     def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
         """Foreground opacity [H, W] in [0, 1] of test view `camera` at timestep `t`."""
         if t not in self._faded:
             return self._submission.alpha(camera, t)
-        before, after = (self._submission.alpha(camera, t + side) for side in (-1, 1))
-        share = np.float32(self._share(camera, t))
-        return np.asarray((1 - share) * before + share * after, dtype=np.float32)
+        around, share = self._around(camera, t)
+        before, after = (self._submission.alpha(camera, seen) for seen in around)
+        return np.asarray((1 - np.float32(share)) * before + np.float32(share) * after, dtype=np.float32)
 
     def particles(self) -> None:
         """None: where timesteps are withheld there are none to compare."""
@@ -59,7 +59,11 @@ class FadedSubmission:
     def geometry(self) -> None:
         """None, as `particles`."""
 
-    def _share(self, camera: str, t: int) -> float:
-        """How far `t` is on its way from the timestep before to the one after, by the camera's clock: in (0, 1)."""
-        before, now, after = self._scene.camera_times[camera][t - 1 : t + 2]
-        return float((now - before) / (after - before))
+    def _around(self, camera: str, t: int) -> tuple[tuple[int, int], float]:
+        """The timesteps before and after `t` that the method saw; and how far `t` is on its way from one to the other
+        by the camera's clock, in (0, 1)."""
+        before, after = seen_around(t, self._scene.n_frames, self.identity.withheld)
+        assert before is not None  # `t` is one that is scored
+        assert after is not None
+        times = self._scene.camera_times[camera]
+        return (before, after), float((times[t] - times[before]) / (times[after] - times[before]))

@@ -35,6 +35,16 @@ def test_both_results_and_all_that_was_noted_come_back(cores: int) -> None:
     assert set(run.stages) == {"both", "first"}
 
 
+def test_a_long_note_goes_on_in_others() -> None:
+    run = Run()
+    text = "".join(str(n % 10) for n in range(1200))
+    run.note("found", text)
+    run.note("nothing", "")
+    assert [len(part) for part in run.notes.values()] == [500, 500, 200, 0]
+    assert list(run.notes) == ["found", "found 2", "found 3", "nothing"]
+    assert "".join(run.notes.values()) == text
+
+
 def test_they_run_at_the_same_time_where_there_are_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(side_by_side, "thread_count", lambda: 2)
     meeting = threading.Barrier(2, timeout=30)

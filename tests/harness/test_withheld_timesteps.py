@@ -14,7 +14,7 @@ from splashbench.harness.runner import run_method
 from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Camera, Particles, Scene, TrainingScene
 from splashbench.score import score_submission
-from splashbench.submission.withheld import kept_timesteps, scored_timesteps
+from splashbench.submission.withheld import kept_timesteps, scored_timesteps, seen_around
 
 METHOD = f"{Path(__file__).resolve()}:Clock"
 
@@ -54,6 +54,31 @@ def test_which_timesteps() -> None:
     # The last one of an even number lies outside what was seen.
     assert scored_timesteps(8, "odd") == (1, 3, 5)
     assert kept_timesteps(3, None) == scored_timesteps(3, None) == (0, 1, 2)
+
+
+def test_each_third_and_some_at_random() -> None:
+    assert kept_timesteps(8, "keep_1_of_3") == (0, 3, 6)
+    assert scored_timesteps(8, "keep_1_of_3") == (1, 2, 4, 5)
+    kept = {percent: kept_timesteps(40, f"drop_{percent}_percent") for percent in (10, 35, 99)}
+    assert [len(steps) for steps in kept.values()] == [36, 26, 2]
+    for steps in kept.values():
+        assert steps == tuple(sorted(steps))
+        assert {0, 39} <= set(steps)
+    assert set(kept[99]) < set(kept[35]) < set(kept[10])
+    gaps = np.diff(kept[35])
+    assert gaps.max() >= 3 > gaps.min()
+    assert set(scored_timesteps(40, "drop_35_percent")) == set(range(40)) - set(kept[35])
+    assert seen_around(4, 8, "keep_1_of_3") == (3, 6)
+    assert seen_around(7, 8, "keep_1_of_3") == (6, None)
+
+
+@pytest.mark.parametrize("word", ["even", "keep_1_of_1", "keep_1_of_0", "drop_0_percent", "drop_100_percent", "odd\n"])
+def test_a_word_that_says_nothing_is_refused(word: str, balls: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SplashbenchError, match="which timesteps to withhold"):
+        kept_timesteps(8, word)
+    with pytest.raises(SystemExit):
+        main(["run", "hull_points", str(balls.directory), "OUT", "--withhold", word])
+    assert "keep_1_of_3" in capsys.readouterr().err
 
 
 def test_the_method_sees_every_second_timestep_and_nothing_of_the_others(balls: Scene, tmp_path: Path) -> None:
@@ -146,3 +171,22 @@ def test_two_timesteps_are_too_few(tmp_path: Path, capsys: pytest.CaptureFixture
     write_balls_scene(tmp_path / "two", n_frames=2)
     assert main(["run", "hull_points", str(tmp_path / "two"), str(tmp_path / "out"), "--withhold", "odd"]) == 1
     assert "takes three" in capsys.readouterr().err
+
+
+def test_a_recording_too_short_for_it_is_refused(balls: Scene, tmp_path: Path, capsys) -> None:
+    words = ["run", "hull_points", str(balls.directory), str(tmp_path / "out"), "--withhold", "keep_1_of_900"]
+    assert main(words) == 1
+    assert "leaves none between two that are seen" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_faded_reaches_over_wider_gaps(balls: Scene, tmp_path: Path) -> None:
+    from splashbench.submission import Submission
+    from splashbench.submission.faded import FadedSubmission
+
+    run_method(METHOD, balls.directory, tmp_path / "third", timing_frames=0, withheld="keep_1_of_3")
+    faded = FadedSubmission(Submission.open(tmp_path / "third"), balls)
+    name = balls.test[0]
+    for t in scored_timesteps(balls.n_frames, "keep_1_of_3"):
+        shown = faded.rendering(name, t).astype(int)
+        assert np.abs(shown - round(255 * float(balls.camera_times[name][t]))).max() <= 1

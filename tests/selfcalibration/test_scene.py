@@ -247,7 +247,7 @@ def test_a_right_scene_is_said_to_be_and_still_copied(
     out = tmp_path / "copy"
     assert main(["scene", "self-calibrate", str(balls_directory), "--out", str(out)]) == 0
     captured = capsys.readouterr()
-    assert captured.out == "cameras and clocks are as told\n"
+    assert captured.out == "cameras, clocks and masks are as told\n"
     assert "nothing was found" in captured.err
     copy = Scene.open(out)
     assert copy.digest == balls.digest

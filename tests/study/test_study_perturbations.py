@@ -59,6 +59,7 @@ from splashbench.study.perturbations.setup import ContainerMisplaced, GravityErr
 from splashbench.study.scenes import changed_scene, recording_of
 from splashbench.study.spec import StudyVariant
 from splashbench.study.thinning import thinned
+from splashbench.submission.withheld import kept_timesteps
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 8
 DICE = Dice(3, "a recording")
@@ -110,7 +111,7 @@ def severities(kind: type[Step]) -> list[Step]:
 
 
 def harm(worse: Recording, given: Recording) -> float:
-    """Some measure of all that differs."""
+    """Some measure of all that differs in what is seen."""
     total = 0.0
     assert given.gravity is not None
     assert given.container_pose is not None
@@ -136,7 +137,8 @@ def test_every_kind_has_five_severities_each_worse_than_the_last(kind: type[Step
     assert kind.unit
     assert kind.__doc__
     # What is drawn is the same at every severity, but for frames and masks that are drawn by their number.
-    worse = [harm(perturbed(given, [step], DICE), given) for step in steps]
+    unseen = [FRAMES - len(kept_timesteps(FRAMES, step.withheld)) for step in steps]
+    worse = [harm(perturbed(given, [step], DICE), given) + left_out for step, left_out in zip(steps, unseen)]
     assert worse[0] > 0
     assert worse == sorted(worse)
     assert worse[-1] > 1.5 * worse[0]
@@ -165,7 +167,8 @@ def test_a_seed_decides_all_and_pictures_may_be_asked_for_in_any_order(kind: typ
 def test_none_of_it_changes_nothing(kind: type[Step]) -> None:
     if kind is Compression:
         return  # it has no such amount: rate factor 0 is another colour space
-    assert harm(perturbed(recording(), [kind.at(0)], DICE), recording()) == pytest.approx(0, abs=1e-9)
+    assert kind.at(kind.none).withheld is None
+    assert harm(perturbed(recording(), [kind.at(kind.none)], DICE), recording()) == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("amount", [-1, float("nan"), float("inf"), 1e9])
@@ -471,6 +474,20 @@ def test_the_container_is_stated_that_far_away() -> None:
     for lacking in ({"container_pose": None}, {"metres_per_unit": None}):
         with pytest.raises(SplashbenchError, match="container_misplaced"):
             perturbed(replace(recording(), **lacking), [ContainerMisplaced(amount=5)], DICE)
+
+
+def test_what_is_left_out_is_withheld_from_the_run(balls: Scene, tmp_path: Path) -> None:
+    row = {"name": "v", "perturbation": [{"kind": "fewer_timesteps", "amount": 3}]}
+    variant = StudyVariant.model_validate(row)
+    assert (variant.unseen, variant.harm) == ("keep_1_of_3", ())
+    assert changed_scene(balls, variant, 1, tmp_path) is balls
+    both = StudyVariant.model_validate(
+        row | {"perturbation": [{"kind": "exposure", "amount": 1}, {"kind": "uneven_timesteps", "amount": 0.35}]}
+    )
+    assert both.unseen == "drop_35_percent"
+    assert [step.kind for step in both.harm] == ["exposure"]
+    with pytest.raises(ValidationError, match="withheld twice: odd and keep_1_of_3"):
+        StudyVariant.model_validate(row | {"withheld": "odd"})
 
 
 def test_nothing_is_read_before_it_is_asked_for() -> None:

@@ -1,4 +1,4 @@
-"""Training targets at half their size: what large photographs teach first, at a quarter of the pixels.
+"""Training targets at half and a quarter of their size: what large photographs teach first, with fewer pixels.
 
 Scaffold-GS and its kin begin with small images, too. Not in the paper, whose images are as they are.
 """
@@ -21,21 +21,34 @@ from ..kernel.window_loss import WindowPhotograph
 from .photographs import Deferred, Photograph, Shelf, read_now
 from .targets import TrainingTarget, windowed
 
+#: How often photographs are halved. Windows begin at pixels that this leaves whole.
+HALVINGS = 2
 
-def with_half_size(
+
+def with_smaller(
     targets: list[TrainingTarget],
     backgrounds: Mapping[str, np.ndarray],
     walls: Mapping[str, np.ndarray | None],
 ) -> None:
-    """Give each target its `coarse` one, in place.
+    """Give each target its `coarse` one of half the size, and that one its own, in place.
 
     backgrounds: float32 [H, W, 3] or [3] by view; walls: float32 [H, W] or None by view; of whole images, which the
-    targets' windows are parts of and begin at even pixels of. They are halved once each, and shared. Photographs are
-    kept as far as there is room.
+    targets' windows are parts of. They are halved once each, and shared. Of photographs the larger ones are kept, as
+    far as there is room; smaller ones are made of these whenever they are to teach.
     """
-    behind = {name: _halved(torch.from_numpy(image)) for name, image in backgrounds.items()}
-    before = {name: None if wall is None else _halved(torch.from_numpy(wall)) for name, wall in walls.items()}
-    shelf = Shelf()
+    behind = {name: torch.from_numpy(image) for name, image in backgrounds.items()}
+    before = {name: None if wall is None else torch.from_numpy(wall) for name, wall in walls.items()}
+    for number in range(HALVINGS):
+        behind = {name: _halved(image) for name, image in behind.items()}
+        before = {name: None if wall is None else _halved(wall) for name, wall in before.items()}
+        _halve(targets, behind, before, Shelf() if number == 0 else Shelf(0))
+        targets = [target.coarse for target in targets if target.coarse is not None]
+
+
+def _halve(
+    targets: list[TrainingTarget], behind: Mapping[str, Tensor], before: Mapping[str, Tensor | None], shelf: Shelf
+) -> None:
+    """Give each target its `coarse` one, in place. behind, before: of whole images of its size."""
 
     def halve(target: TrainingTarget) -> None:
         later = Deferred(partial(_read_halved, target.photograph))
@@ -47,14 +60,16 @@ def with_half_size(
     each(halve, targets)
 
 
-def set_half_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
-    """Put others behind the `coarse` ones of `targets` where these have one, in place; see `with_half_size`."""
-    behind = {name: _halved(torch.from_numpy(image)) for name, image in backgrounds.items()}
-    for target in targets:
-        if target.coarse is not None:
-            x, y = target.corner
-            corner = (x // 2, y // 2)
-            target.coarse.background = windowed(behind[target.camera.name], corner, target.coarse.camera)
+def set_smaller_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
+    """Put others behind the smaller ones of `targets` where these have some, in place; see `with_smaller`."""
+    behind = {name: torch.from_numpy(image) for name, image in backgrounds.items()}
+    for _ in range(HALVINGS):
+        targets = [target.coarse for target in targets if target.coarse is not None]
+        if not targets:
+            return
+        behind = {name: _halved(image) for name, image in behind.items()}
+        for target in targets:
+            target.background = windowed(behind[target.camera.name], target.corner, target.camera)
 
 
 def half_size(
@@ -74,6 +89,8 @@ def half_size(
         photograph=photograph,
         background=background if background.ndim == 1 else background[window],
         area=target.area / 4,
+        corner=(x, y),
+        coarse=None,
         wall=None if wall is None else wall[window],
     )
 

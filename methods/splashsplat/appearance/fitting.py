@@ -63,8 +63,8 @@ class FitSettings:
     `AdaptiveSchedule`. prune_opacity: carriers whose learned opacity is below this at one of `_PRUNINGS` are not
     fitted any further; 0 fits all to the end. feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is
     that of the shared parts. coarse_share: of the iterations, the first ones, that see targets at half
-    their size where these have one. plates_share: of the iterations, the first ones, for which the background is not
-    needed yet.
+    their size where these have one; coarsest_share: of all, the first ones, that see them at a quarter.
+    plates_share: of the iterations, the first ones, for which the background is not needed yet.
     """
 
     iterations: int = 1000
@@ -82,6 +82,7 @@ class FitSettings:
     prune_opacity: float = 0.0
     idle_share: float = 0.0
     coarse_share: float = 0.0
+    coarsest_share: float = 0.0
     plates_share: float = 0.0
     weights: losses.LossWeights = field(default_factory=losses.LossWeights)
 
@@ -325,8 +326,11 @@ def fit_appearance(
 
     def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
         """`target` in the size that it has at `iteration`."""
-        early = schedule.done(iteration) < settings.coarse_share
-        return target.coarse if early and target.coarse is not None else target
+        done = schedule.done(iteration)
+        for share in (settings.coarse_share, settings.coarsest_share):
+            if done < share and target.coarse is not None:
+                target = target.coarse
+        return target
 
     reader = ReadAhead()
     prunings = {round(share * settings.iterations) for share in _PRUNINGS}
@@ -339,6 +343,9 @@ def fit_appearance(
         if schedule.due(iteration):
             schedule.look(iteration, loss_of_withheld())
         factor = schedule.factor(iteration)
+        if schedule.done(iteration) >= settings.coarse_share:
+            for target in targets:
+                target.coarse = None  # large, and not wanted any more
         if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
             if offer is not None and iteration >= shown_from:
                 offer(state, True)

@@ -47,7 +47,7 @@ class TrainingTarget:
     in_front: bool [n], carriers of the frame that lie before the wall, or None for none.
     frozen: the background's Gaussians, where they are drawn together with the liquid's; modes: the tiles whose colour
     the losses read, see `splashbench.render.tile_modes`.
-    coarse: the same at half the size, for the fit's first part, or None; see coarse.py.
+    coarse: the same at half the size, for the fit's first part, which may have one itself, or None; see coarse.py.
     """
 
     frame: int
@@ -152,7 +152,7 @@ def collect_targets(
     hidden: Callable[[str, np.ndarray], np.ndarray] | None = None,
     cut: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray] | None] | None = None,
     frozen: Mapping[str, Frozen] | None = None,
-    even: bool = False,
+    blocks: int = 1,
 ) -> list[TrainingTarget]:
     """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
 
@@ -163,11 +163,12 @@ def collect_targets(
     (bool [n]); None for none. frozen: of each view, Gaussians of the background that are drawn together with
     the liquid's. silhouette_norm: the silhouette term averages over the "image", as in the paper, whose images are
     crops about the liquid; or over the "window" around all masks of the view, such a crop of images that are none; or
-    over the "mask". even: windows begin at even pixels, so that half-size ones are parts of half-size images.
+    over the "mask". blocks: windows begin at pixels that this divides, so that smaller ones are parts of smaller
+    images; where it is above 1, photographs are read when they are to teach.
     """
     frozen = frozen or {}
-    # Half-size photographs stand for these in most of the fit.
-    shelf = Shelf(0 if even else KEPT_BYTES)
+    # Smaller photographs stand for these in most of the fit.
+    shelf = Shelf(KEPT_BYTES if blocks == 1 else 0)
     targets = []
     for view, name in enumerate(scene.train):
         camera = scene.cameras[name]
@@ -190,8 +191,7 @@ def collect_targets(
                 continue
             box = _extent(mask, MASK_MARGIN)
             x0, y0, x1, y1 = (0, 0, camera.width, camera.height) if whole else _window(camera, box, positions)
-            if even:
-                x0, y0 = x0 - x0 % 2, y0 - y0 % 2
+            x0, y0 = x0 - x0 % blocks, y0 - y0 % blocks
             part = slice(box[1], box[3]), slice(box[0], box[2])
             at = (box[0] - x0, box[1] - y0)
             photograph = (

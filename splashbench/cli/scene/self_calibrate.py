@@ -1,4 +1,4 @@
-"""`splashbench scene self-calibrate`: find clocks, cameras and exposures that are other than the scene says."""
+"""`splashbench scene self-calibrate`: find clocks, cameras, exposures and masks that are other than the scene says."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ examples:
   splashbench scene self-calibrate real_scene/bowl_001 --out corrected/bowl_001
 
 It looks at the training views alone: at what they show in common of the still surroundings, and at droplets in their
-masks. --out writes a copy for any method to be run on: photographs evenly exposed and straightened, with the cameras
-and the clocks that were found. Test views stay as they are. splashsplat does the same by itself before it fits.
+masks; and it holds masks against photographs. --out writes a copy for any method to be run on: photographs evenly
+exposed and straightened, with the cameras, the clocks and the masks that were found. Test views stay as they are.
+splashsplat does the same by itself before it fits. `splashbench masks` draws the outlines of the copy to look at.
 """
 
 
@@ -31,8 +32,8 @@ def register(actions: argparse._SubParsersAction) -> None:
         actions,
         "self-calibrate",
         self_calibrate,
-        summary="find clocks, cameras and exposures that are other than it says",
-        description="Find by the footage of SCENE which clocks, cameras and exposures are other than it says.",
+        summary="find clocks, cameras, exposures and masks that are other than it says",
+        description="Find by the footage of SCENE which clocks, cameras, exposures and masks are other than it says.",
         epilog=_EPILOG,
     )
     add_scene(action)
@@ -68,7 +69,7 @@ def self_calibrate(arguments: argparse.Namespace) -> int:
         written = None if out is None else {"out": str(out), "digest": Scene.open(out).digest}
         emit({"scene": str(arguments.scene), **_facts(scene, found), "written": written})
     else:
-        for line in found.lines(told) or ["cameras and clocks are as told"]:
+        for line in found.lines(told) or ["cameras, clocks and masks are as told"]:
             print(line)
     if out is not None:
         say(f"{out} is ready: {'the scene as found' if found else 'the scene as it was, since nothing was found'}")
@@ -105,5 +106,9 @@ def _facts(scene: Scene, found: SelfCalibration) -> dict[str, Any]:
         "exposures": {
             name: {"stops": response.stops.tolist(), "contrast": response.contrast}
             for name, response in found.responses.items()
+        },
+        "masks": {
+            name: {"timesteps": sorted(outline.masks.bits), "reach_beyond_px": outline.beyond}
+            for name, outline in found.outlines.items()
         },
     }

@@ -33,6 +33,7 @@ from .masks import (
 )
 from .recording import Dice, Recording, Step
 from .setup import ContainerMisplaced, GravityError, MissingCameras
+from .timesteps import FewerTimesteps, UnevenTimesteps
 
 Perturbation = Annotated[
     EmptyMasks
@@ -49,6 +50,8 @@ Perturbation = Annotated[
     | DroppedFrames
     | DoubledFrames
     | MotionBlur
+    | FewerTimesteps
+    | UnevenTimesteps
     | PoseRotation
     | PoseTranslation
     | FocalError

@@ -121,6 +121,11 @@ class Step(BaseModel):
         """The step of this kind with that amount."""
         return cls.model_validate({"kind": cls.named(), cls.measured: amount})
 
+    @property
+    def withheld(self) -> str | None:
+        """The timesteps that it leaves out, as submission/withheld.py says it; None for none."""
+        return None
+
     def applied(self, recording: Recording, dice: Dice) -> Recording:
         """`recording` as it is with that; nothing is read before it is asked for."""
         raise NotImplementedError

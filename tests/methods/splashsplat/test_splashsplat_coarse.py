@@ -8,8 +8,8 @@ from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance import coarse as coarse_module
 from splashbench_methods.splashsplat.appearance.coarse import (
     halved_photograph,
-    set_half_backgrounds,
-    with_half_size,
+    set_smaller_backgrounds,
+    with_smaller,
 )
 from splashbench_methods.splashsplat.appearance.photographs import Deferred, ReadAhead, Shelf, read_now
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
@@ -44,7 +44,7 @@ def target(width: int = SIZE, height: int = SIZE, top: int = 4, left: int = 4, r
 def halved(fine: TrainingTarget) -> TrainingTarget:
     """`fine`, whose window is the whole image, at half its size."""
     assert fine.wall is not None
-    with_half_size([fine], {"1": fine.background.numpy()}, {"1": fine.wall.numpy()})
+    with_smaller([fine], {"1": fine.background.numpy()}, {"1": fine.wall.numpy()})
     assert fine.coarse is not None
     return fine.coarse
 
@@ -104,7 +104,7 @@ def test_windows_of_one_image_share_its_half() -> None:
         made.corner = (x, y)
         made.background = torch.from_numpy(whole)[y : y + made.camera.height, x : x + 20]
         targets.append(made)
-    with_half_size(targets, {"1": whole}, {"1": wall})
+    with_smaller(targets, {"1": whole}, {"1": wall})
     storages = set()
     for made in targets:
         coarse = made.coarse
@@ -119,8 +119,8 @@ def test_windows_of_one_image_share_its_half() -> None:
     assert len(storages) == 1
     # Another background is halved in the same way.
     expected = [made.coarse.background.clone() for made in targets if made.coarse]
-    with_half_size(targets, {"1": np.zeros_like(whole)}, {"1": wall})
-    set_half_backgrounds(targets, {"1": whole})
+    with_smaller(targets, {"1": np.zeros_like(whole)}, {"1": wall})
+    set_smaller_backgrounds(targets, {"1": whole})
     for made, wanted in zip(targets, expected, strict=True):
         assert made.coarse is not None
         assert torch.equal(made.coarse.background, wanted)
@@ -157,10 +157,35 @@ def test_photographs_beyond_the_room_are_read_again_each_time() -> None:
     assert int(read_now(photographs[2]).image[0, 0, 0]) == 2
 
 
+def test_the_coarsest_are_the_coarse_ones_halved() -> None:
+    made = target(width=24, height=24)
+    before = read_now(made.photograph)
+    coarse = halved(made)
+    coarsest = coarse.coarse
+    assert coarsest is not None
+    assert coarsest.coarse is None
+    assert (coarsest.camera.width, coarsest.camera.height) == (6, 6)
+    assert coarsest.area == made.area / 16
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, size=(20, 3))
+    np.testing.assert_allclose(coarsest.camera.project(points)[0], made.camera.project(points)[0] / 4)
+    # It is made of the coarse one whenever it is to teach.
+    assert isinstance(coarsest.photograph, Deferred)
+    again = read_now(coarsest.photograph)
+    expected = halved_photograph(halved_photograph(before))
+    assert torch.equal(again.image, expected.image)
+    assert torch.equal(again.mask, expected.mask)
+    block = made.background[4:8, 8:12].mean(dim=(0, 1))
+    torch.testing.assert_close(coarsest.background[1, 2], block)
+    behind = torch.rand(24, 24, 3)
+    set_smaller_backgrounds([made], {"1": behind.numpy()})
+    torch.testing.assert_close(coarsest.background[1, 2], behind[4:8, 8:12].mean(dim=(0, 1)))
+    torch.testing.assert_close(coarse.background[1, 2], behind[2:4, 4:6].mean(dim=(0, 1)))
+
+
 def test_a_colour_behind_everything_stays_one() -> None:
     made = target()
     made.background = torch.tensor([0.1, 0.2, 0.3])
-    with_half_size([made], {"1": np.array([0.1, 0.2, 0.3], np.float32)}, {"1": None})
+    with_smaller([made], {"1": np.array([0.1, 0.2, 0.3], np.float32)}, {"1": None})
     assert made.coarse is not None
     assert made.coarse.background.tolist() == pytest.approx([0.1, 0.2, 0.3])
     assert made.coarse.wall is None
@@ -179,7 +204,7 @@ def test_a_coarse_pixel_is_the_rounded_mean_of_four() -> None:
 
 def test_coarse_photographs_beyond_the_room_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = halved(target()).photograph
-    monkeypatch.setattr(coarse_module, "Shelf", lambda: Shelf(room=0))
+    monkeypatch.setattr(coarse_module, "Shelf", lambda room=0: Shelf(room=0))
     later = halved(target()).photograph
     assert isinstance(kept, WindowPhotograph)
     assert isinstance(later, Deferred)

@@ -1,0 +1,337 @@
+"""Where photographs say that liquid ends, against where masks do.
+
+Two things tell a pixel of liquid: how it differs from the clean plate, and its colour. Histograms of both are counted
+deep inside a camera's masks and far outside of them, where masks are hardly ever wrong; their likelihood ratio tells
+the pixels between. What it says stands for the masks in the next round, so that plates and histograms get purer. Masks
+that end elsewhere, miss parts or show something else are replaced by what is said in the end.
+
+Photographs do not tell everywhere: clear liquid before an even wall looks like the wall. So they are asked three times,
+beginning with the masks, with less and with more than these. Where the answers do not meet, masks stay as they are. And
+where outlines are longer than what photographs can show: these are blurred or compressed then, and the masks are not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from splashbench.background.clean_plate import masked_median
+from splashbench.scene.scene import TrainingScene
+
+_Images = NDArray[np.uint8]
+_Masks = NDArray[np.bool_]
+
+# Masks are looked at in at most so many frames of each camera, and with no side longer than this, in pixels.
+_FRAMES, _SIDE = 16, 480
+# Rounds to see whether something is wrong, and to say what is right.
+_ROUNDS, _ROUNDS_MORE = 3, 5
+# Bins of a channel; pixels that every bin has besides, and the width by which bins are smoothed.
+_BINS, _BESIDE, _SMOOTHED = 16, 0.002, 0.8
+# No bin says more than this, in nats; the sum of both says liquid above this much. Colour alone has to say so much.
+_MOST, _FROM, _SURE = 6.0, 0.3, 2.0
+# Deep inside is more than so many pixels, and in the first round deeper than this share of all that is inside: of masks
+# that reach far beyond the liquid only the innermost is liquid. Far outside: in pixels, and as a share of the longer
+# side.
+_DEEP, _DEEPEST, _DEEP_LATER, _FAR, _FAR_LATER = 2.0, 0.75, 1.5, (4.0, 0.02), (2.5, 0.0125)
+# Evidence is smoothed by so much of the longer side, and by so many pixels at least.
+_BLUR, _LEAST_BLUR = 0.002, 0.6
+# Outlines as near as this to each other are the same, in pixels of an image of 240.
+_SAME = 1.25
+# All masks of a camera are replaced where the middle one is wrong by more than the first share of its area, or by more
+# than the second where the middle camera's is; single masks where they are wrong by more than the third. Areas count as
+# the last share of the image at least.
+_WRONG, _WRONG_TOO, _ONE_WRONG, _LEAST_AREA = 0.2, 0.1, 0.3, 0.0005
+# Timesteps that are named, and pixels that are worth a word.
+_NAMED, _WORTH_A_WORD = 5, 0.5
+# Photographs are asked again, beginning with so many pixels less and more. Of what such a start is apart from the
+# masks, so much has to be gone from the answer.
+_STARTS, _MET = (-2.0, 2.0), 0.5
+# How much outline what they say has to have for its area, by what the masks have.
+_AS_SHARP = 0.55
+
+
+@dataclass(frozen=True)
+class PackedMasks:
+    """Masks of one camera by timestep, eight pixels a byte."""
+
+    shape: tuple[int, int]
+    bits: Mapping[int, bytes]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], masks: Iterable[tuple[int, _Masks]]) -> PackedMasks:
+        return cls(shape, {t: np.packbits(mask).tobytes() for t, mask in masks})
+
+    @property
+    def digest(self) -> str:
+        """Tells these masks from others."""
+        return hashlib.sha256(b"".join(b"%d:" % t + bits for t, bits in sorted(self.bits.items()))).hexdigest()
+
+    def __contains__(self, t: int) -> bool:
+        return t in self.bits
+
+    def __getitem__(self, t: int) -> _Masks:
+        flat = np.unpackbits(np.frombuffer(self.bits[t], np.uint8), count=self.shape[0] * self.shape[1])
+        return flat.reshape(self.shape).astype(bool)
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Of one camera: masks as photographs show them, where the told ones are wrong.
+
+    beyond: how far the told masks reach beyond these, in pixels, in the middle; below 0 they end inside.
+    """
+
+    masks: PackedMasks
+    n_frames: int
+    beyond: float
+
+    @property
+    def line(self) -> str:
+        """What is wrong, in words."""
+        wrong = sorted(self.masks.bits)
+        if len(wrong) < self.n_frames:
+            some = ", ".join(map(str, wrong[:_NAMED])) + (" ..." if len(wrong) > _NAMED else "")
+            which = f"{len(wrong)} of {self.n_frames} masks are not what its photographs show (timesteps {some})"
+        elif abs(self.beyond) < _WORTH_A_WORD:
+            which = "masks are not what its photographs show"
+        elif self.beyond > 0:
+            which = f"masks reach {self.beyond:.1f} px beyond what its photographs show"
+        else:
+            which = f"masks end {-self.beyond:.1f} px inside what its photographs show"
+        return f"{which}; replaced by what these show"
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Some frames of one camera, small: images [F, h, w, 3], masks [F, h, w] as told. frames: their timesteps."""
+
+    frames: tuple[int, ...]
+    images: _Images
+    masks: _Masks
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Log likelihood ratios of bins, float32 [bins^3]: of differences from the plate, and of colours."""
+
+    difference: NDArray[np.float32]
+    color: NDArray[np.float32]
+
+    def mask(self, image: _Images, plate: _Images, free: _Masks, told: _Masks) -> _Masks:
+        """What `image` [H, W, 3] says is liquid. Where no frame is `free` of it there is no plate, and
+        the colour says so where it is sure, elsewhere the mask that was told."""
+        color = self.color[_color_bins(image)]
+        each = np.where(free, self.difference[_difference_bins(image, plate)] + color, color)
+        smooth = cv2.GaussianBlur(each, (0, 0), max(_LEAST_BLUR, _BLUR * max(image.shape[:2])))
+        return np.where(free | (np.abs(smooth) > _SURE), smooth > _FROM, told)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What photographs say: masks [F, h, w], and by what they say it; None where they say nothing."""
+
+    masks: _Masks
+    evidence: _Evidence | None
+
+
+def outlines(scene: TrainingScene, names: Sequence[str]) -> dict[str, Outlines]:
+    """The masks of the training cameras `names` of `scene` that are not what the photographs show; none where all are,
+    or where photographs do not tell."""
+    samples = {name: _sample(scene, name) for name in names}
+    if not samples:
+        return {}
+    wrong = {}
+    for name, sample in samples.items():
+        said = _asked(sample, sample.masks, _ROUNDS).masks
+        wrong[name] = np.array([_wrong(*pair) for pair in zip(sample.masks, said)])
+    middle = float(np.median([np.median(of_camera) for of_camera in wrong.values()]))
+    found: dict[str, Outlines] = {}
+    for name, sample in samples.items():
+        if _suspicious(wrong[name], middle).any():
+            answer = _asked(sample, sample.masks, _ROUNDS_MORE)
+            if answer.evidence is not None and _trusted(sample, answer.masks):
+                replaced = _replaced(scene, name, sample, answer, middle)
+                found |= {name: replaced} if replaced else {}
+    return found
+
+
+def _sample(scene: TrainingScene, name: str) -> _Sample:
+    camera = scene.cameras[name]
+    chosen = np.unique(np.linspace(0, scene.n_frames - 1, min(_FRAMES, scene.n_frames)).round().astype(int)).tolist()
+    scale = min(1.0, _SIDE / max(camera.width, camera.height))
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    images = [scene.image(name, t) for t in chosen]
+    masks = [scene.mask(name, t) for t in chosen]
+    return _Sample(
+        tuple(chosen),
+        np.stack(
+            [image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
+        ),
+        np.stack([mask if scale == 1.0 else _resized(mask, size) for mask in masks]),
+    )
+
+
+def _resized(mask: _Masks, size: tuple[int, int]) -> _Masks:
+    """`mask` with `size` (columns, rows)."""
+    smaller = size[0] < mask.shape[1]
+    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    return np.asarray(share >= 0.5)
+
+
+def _asked(sample: _Sample, start: _Masks, rounds: int) -> _Answer:
+    """What the photographs of `sample` say, asked with the masks `start` [F, h, w] in the first round."""
+    longest = max(sample.images.shape[1:3])
+    colors = _color_bins(sample.images)
+    masks, evidence = start, None
+    for number in range(rounds):
+        depth = np.stack([_depth(mask) for mask in masks])
+        pixels, share = _FAR if number == 0 else _FAR_LATER
+        outside = depth < -max(pixels, share * longest)
+        if number == 0:
+            # An empty mask may be one that failed: what it would add to the plate is liquid then.
+            outside &= masks.any(axis=(1, 2), keepdims=True)
+        inside = depth > (_deep(depth) if number == 0 else _DEEP_LATER)
+        if not inside.any() and masks.any():
+            inside = depth >= np.median(depth[masks])
+        free = outside.any(axis=0)
+        plate = masked_median(sample.images, outside)
+        inside &= free
+        if not inside.any() or not outside.any():
+            break
+        differences = _difference_bins(sample.images, plate)
+        evidence = _Evidence(
+            _likelihood_ratio(differences[inside], differences[outside]),
+            _likelihood_ratio(colors[inside], colors[outside]),
+        )
+        masks = np.stack([evidence.mask(image, plate, free, mask) for image, mask in zip(sample.images, masks)])
+    return _Answer(masks, evidence)
+
+
+def _deep(depth: NDArray[np.float32]) -> float:
+    """How deep is deep inside, in pixels, in the first round."""
+    inside = depth[(depth > 0) & np.isfinite(depth)]
+    return max(_DEEP, float(np.quantile(inside, _DEEPEST))) if len(inside) else _DEEP
+
+
+def _trusted(sample: _Sample, answer: _Masks) -> bool:
+    """Whether photographs say much the same as `answer` when they are asked with less or with more than the masks, and
+    show as much of outlines as these."""
+    if _outline(answer) < _AS_SHARP * _outline(sample.masks):
+        return False
+    depth = np.stack([_depth(mask) for mask in sample.masks])
+    met = []
+    for beyond in _STARTS:
+        start = depth > -beyond
+        before = _in_common(sample.masks, start)
+        after = _in_common(answer, _asked(sample, start, _ROUNDS_MORE).masks)
+        met.append((after - before) / max(1 - before, 1e-6))
+    return max(met) >= _MET
+
+
+def _outline(masks: _Masks) -> float:
+    """Pixels along the outlines of `masks` [F, h, w], by their area."""
+    along = sum(int((np.abs(_depth(mask)) < 1).sum()) for mask in masks)
+    return along / max(1, int(masks.sum()))
+
+
+def _in_common(one: _Masks, other: _Masks) -> float:
+    """Intersection over union of all frames together."""
+    return float((one & other).sum() / max(1, (one | other).sum()))
+
+
+def _wrong(told: _Masks, said: _Masks) -> float:
+    """The pixels of `told` [h, w] that are wrong by `said`, by the larger area of both; outlines that are the same but
+    for `_SAME` are right."""
+    height, width = told.shape
+    reach = _SAME * max(1.0, max(height, width) / 240)
+    depth = _depth(told)
+    apart = (said & (depth < -reach)) | (~said & (depth > reach))
+    return float(apart.sum() / max(told.sum(), said.sum(), _LEAST_AREA * height * width))
+
+
+def _suspicious(wrong: NDArray[np.float64], middle: float) -> NDArray[np.bool_]:
+    """Which masks of a camera are to be replaced, bool [F], by how wrong each is, and the middle one of the middle
+    camera."""
+    own = float(np.median(wrong))
+    if own > _WRONG or min(own, middle) > _WRONG_TOO:
+        return np.full(len(wrong), True)
+    return np.asarray(wrong > _ONE_WRONG)
+
+
+def _replaced(scene: TrainingScene, name: str, sample: _Sample, answer: _Answer, middle: float) -> Outlines | None:
+    """The masks of camera `name` in full size, by the evidence of some small frames; None where none is wrong."""
+    assert answer.evidence is not None
+    camera = scene.cameras[name]
+    size = (camera.width, camera.height)
+    same_size = sample.masks.shape[1:] == (camera.height, camera.width)
+    known = answer.masks if same_size else np.stack([_resized(mask, size) for mask in answer.masks])
+    longest = max(size)
+    outside = np.stack([_depth(mask) for mask in known]) < -max(_FAR_LATER[0], _FAR_LATER[1] * longest)
+    free: _Masks = np.asarray(outside.any(axis=0))
+    images = sample.images if same_size else np.stack([scene.image(name, t) for t in sample.frames])
+    plate = masked_median(images, outside)
+    del images, outside
+    right: dict[int, _Masks] = {}
+    wrong, gained, length = np.empty(scene.n_frames), np.empty(scene.n_frames), np.empty(scene.n_frames)
+    for t in range(scene.n_frames):
+        told = scene.mask(name, t)
+        right[t] = answer.evidence.mask(scene.image(name, t), plate, free, told)
+        wrong[t] = _wrong(told, right[t])
+        gained[t] = float(told.sum()) - float(right[t].sum())
+        length[t] = (np.abs(_depth(right[t])) < 1).sum() / 2
+    chosen = np.nonzero(_suspicious(wrong, middle))[0].tolist()
+    if not chosen:
+        return None
+    beyond = float(np.median(gained[chosen] / np.maximum(length[chosen], 1)))
+    return Outlines(PackedMasks.of(told.shape, ((t, right[t]) for t in chosen)), scene.n_frames, beyond)
+
+
+def _depth(mask: _Masks) -> NDArray[np.float32]:
+    """Pixels from the outline of `mask` [h, w], below 0 outside."""
+    if not mask.any() or mask.all():
+        return np.full(mask.shape, np.inf if mask.any() else -np.inf, np.float32)
+    inside, outside = (
+        cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (mask, ~mask)
+    )
+    return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
+
+
+@cache
+def _bins_of_differences() -> NDArray[np.uint16]:
+    """The bin of a difference of -255 to 255, in this order; finer where it is small."""
+    share = np.arange(-255, 256) / 255
+    return np.minimum((0.5 + 0.5 * np.sign(share) * np.sqrt(np.abs(share))) * _BINS, _BINS - 1).astype(np.uint16)
+
+
+def _color_bins(images: _Images) -> NDArray[np.uint16]:
+    """Of uint8 [..., 3] the number of the bin, [...]."""
+    parts = images // np.uint8(256 // _BINS)
+    return _numbered(parts.astype(np.uint16))
+
+
+def _difference_bins(images: _Images, plate: _Images) -> NDArray[np.uint16]:
+    """Of uint8 [..., H, W, 3] less `plate` the number of the bin, [..., H, W]."""
+    return _numbered(_bins_of_differences()[images.astype(np.int16) - plate + 255])
+
+
+def _numbered(parts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    return np.asarray((parts[..., 0] * _BINS + parts[..., 1]) * _BINS + parts[..., 2])
+
+
+def _likelihood_ratio(inside: NDArray[np.uint16], outside: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """log(p(bin | inside) / p(bin | outside)) of every bin, float32."""
+    ratio = np.log(_density(inside)) - np.log(_density(outside))
+    return np.clip(ratio, -_MOST, _MOST).astype(np.float32)
+
+
+def _density(bins: NDArray[np.uint16]) -> NDArray[np.float64]:
+    counts = np.bincount(bins, minlength=_BINS**3).astype(np.float64).reshape(_BINS, _BINS, _BINS)
+    smooth = gaussian_filter(counts, _SMOOTHED) + _BESIDE
+    return np.asarray((smooth / smooth.sum()).ravel())
