@@ -44,10 +44,10 @@ _DEEP, _DEEPEST, _DEEP_LATER, _FAR, _FAR_LATER = 2.0, 0.75, 1.5, (4.0, 0.02), (2
 _BLUR, _LEAST_BLUR = 0.002, 0.6
 # Outlines as near as this to each other are the same, in pixels of an image of 240.
 _SAME = 1.25
-# All masks of a camera are replaced where the middle one is wrong by more than the first share of its area, or by more
-# than the second where the middle camera's is; single masks where they are wrong by more than the third. Areas count as
-# the last share of the image at least.
-_WRONG, _WRONG_TOO, _ONE_WRONG, _LEAST_AREA = 0.2, 0.1, 0.3, 0.0005
+# The masks of a camera are replaced where the middle one is wrong by more than the first share of its area, or by more
+# than the second where the middle camera's is, but for those that are wrong by less than the third; single masks where
+# they are wrong by more than the fourth. Areas count as the last share of the image at least.
+_WRONG, _WRONG_TOO, _RIGHT, _ONE_WRONG, _LEAST_AREA = 0.2, 0.1, 0.05, 0.3, 0.0005
 # Timesteps that are named, and pixels that are worth a word.
 _NAMED, _WORTH_A_WORD = 5, 0.5
 # Photographs are asked again, beginning with so many pixels less and more. Of what such a start is apart from the
@@ -261,7 +261,7 @@ def _suspicious(wrong: NDArray[np.float64], middle: float) -> NDArray[np.bool_]:
     camera."""
     own = float(np.median(wrong))
     if own > _WRONG or min(own, middle) > _WRONG_TOO:
-        return np.full(len(wrong), True)
+        return np.asarray(wrong > _RIGHT)
     return np.asarray(wrong > _ONE_WRONG)
 
 
