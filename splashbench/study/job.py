@@ -103,9 +103,9 @@ class Store:
     def entry_path(self, digest: str) -> Path:
         return self.runs / f"{digest[:16]}.json"
 
-    def picture_path(self, digest: str) -> Path:
-        """A render of the run: of the first test view, in the middle of the recording."""
-        return self.out / "pictures" / f"{digest[:16]}.png"
+    def picture_path(self, digest: str, t: int) -> Path:
+        """A render of the run: of the first test view at timestep `t`, see `pictured_timestep`."""
+        return self.out / "pictures" / f"{digest[:16]}_t{t}.png"
 
     def reference_path(self, digest: str) -> Path:
         """Folder of the submission of a reference run, which other runs are scored against."""
@@ -118,6 +118,12 @@ class Store:
             return None
         submission = Submission.open(path)
         return submission if submission.status == Status.OK else None
+
+
+def pictured_timestep(n_frames: int) -> int:
+    """The timestep of a run's picture: in the middle, and an odd one, which a method is mostly not shown where
+    timesteps are withheld."""
+    return min(n_frames // 2 | 1, n_frames - 1)
 
 
 def carry_out(job: Job) -> RunEntry:
@@ -171,7 +177,10 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     result = score_submission(scene, submission, reference, weights, fields=shared_fields(original))
     saved, faded = result.save(store.results), None
     if job.picture and submission.status == Status.OK:
-        _keep_picture(submission, scene, store.picture_path(job.digest))
+        t = pictured_timestep(scene.n_frames)
+        path = store.picture_path(job.digest, t)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, submission.rendering(scene.test[0], t))
     if job.variant.unseen and submission.status == Status.OK:
         control = FadedSubmission(submission, scene)
         faded = score_submission(scene, control, reference, weights, fields=shared_fields(original)).save(store.results)
@@ -187,11 +196,6 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
             "train_views": list(scene.train),
         }
     )
-
-
-def _keep_picture(submission: Submission, scene: Scene, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, submission.rendering(scene.test[0], scene.n_frames // 2))
 
 
 def carry_out_file(file: str) -> int:

@@ -22,6 +22,7 @@ from splashbench.study.scenes import recording_of
 from splashbench.study.spec import SceneEntry, StudySpec, StudyVariant, metric_of
 from splashbench.study.stability import StressRun
 from splashbench.study.table import StudyRun
+from splashbench.submission.withheld import scored_timesteps
 
 #: The control that shows what a recording gives without any liquid.
 NOTHING = "nothing"
@@ -189,6 +190,9 @@ def _labels(chosen: Sequence[tuple[str, str | None, Mapping[str, Any]]]) -> list
 def _impossible(recordings: Mapping[str, Recording], harm: Harm) -> str | None:
     """Why one of `recordings` cannot have `harm`; None where all can."""
     for name, recording in recordings.items():
+        unseen = harm.step.withheld
+        if unseen is not None and not scored_timesteps(recording.n_frames, unseen):
+            return f"{name}: of {recording.n_frames} timesteps {unseen} leaves none between two that are seen"
         try:
             perturbed(recording, [harm.step], Dice(0, name))
         except SplashbenchError as error:

@@ -19,7 +19,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, write_text
 from splashbench.markdown import table as markdown_table
 from splashbench.scene import Scene
-from splashbench.study.job import Store
+from splashbench.study.job import Store, pictured_timestep
 from splashbench.study.stability import BROKEN, StressRun
 from splashbench.study.stress import Harm, StressPlan
 
@@ -155,7 +155,7 @@ def _strip(
         worse = _render(stress, store, label, scene.name, (kind, level))
         if whole is None or worse is None:
             continue
-        view, middle = scene.scene.test[0], scene.scene.n_frames // 2
+        view, middle = scene.scene.test[0], pictured_timestep(scene.scene.n_frames)
         truth = scene.scene.image(view, middle)
         window = _window(scene.scene, view, middle)
         harm = next(h for h in stress.harms if h.kind.named() == kind and h.level == level)
@@ -176,11 +176,12 @@ def _render(
     for run in stress.plan.runs:
         of, what = stress.rows[run.variant.name]
         same = harm is None if what is None else harm == (what.kind.named(), what.level)
-        if of == label and run.scene.name == scene and same and store.picture_path(run.digest).is_file():
+        path = store.picture_path(run.digest, pictured_timestep(run.scene.scene.n_frames))
+        if of == label and run.scene.name == scene and same and path.is_file():
             try:
-                return np.asarray(imageio.imread(store.picture_path(run.digest)))[..., :3]
+                return np.asarray(imageio.imread(path))[..., :3]
             except (OSError, ValueError) as error:
-                raise SplashbenchError(f"{store.picture_path(run.digest)} is no picture; delete it: {error}") from None
+                raise SplashbenchError(f"{path} is no picture; delete it: {error}") from None
     return None
 
 

@@ -117,3 +117,14 @@ def test_a_method_may_come_with_two_presets(balls_directory: Path) -> None:
         "splashsplat-best.as_recorded",
         "splashsplat-best.haze.2",
     ]
+
+
+def test_timesteps_that_a_scene_cannot_do_without_are_left_out(balls_directory: Path) -> None:
+    kinds, levels = ("fewer_timesteps",), (1, 4, 5)
+    plan = make_stress_plan([GREY], [str(balls_directory)], kinds=kinds, levels=levels)
+    assert [harm.amount for harm in plan.harms] == [2, 6]  # of 8 timesteps
+    assert [(harm.amount, reason) for harm, reason in plan.left_out] == [
+        (8, "balls: of 8 timesteps keep_1_of_8 leaves none between two that are seen")
+    ]
+    unseen = {run.variant.unseen for run in plan.plan.runs}
+    assert unseen == {None, "keep_1_of_2", "keep_1_of_6"}

@@ -18,7 +18,7 @@ class FewerTimesteps(Step):
 
     kind: Literal["fewer_timesteps"] = "fewer_timesteps"
     amount: int = Field(ge=0, le=999)
-    unit: ClassVar[str] = "timesteps between two recorded ones"
+    unit: ClassVar[str] = "timesteps apart"
     remedy: ClassVar[str] = "Record at a higher frame rate: a splash moves by its own width within a frame."
     ladder: ClassVar[tuple[float, ...]] = (2, 3, 4, 6, 8)
     none: ClassVar[float] = 1.0
