@@ -194,9 +194,10 @@ def _asked(sample: _Sample, start: _Masks, rounds: int) -> _Answer:
         depth = np.stack([_depth(mask) for mask in masks])
         pixels, share = _FAR if number == 0 else _FAR_LATER
         outside = depth < -max(pixels, share * longest)
-        if number == 0:
+        shown = masks.any(axis=(1, 2), keepdims=True)
+        if number == 0 and shown.mean() > 0.5:
             # An empty mask may be one that failed: what it would add to the plate is liquid then.
-            outside &= masks.any(axis=(1, 2), keepdims=True)
+            outside &= shown
         inside = depth > (_deep(depth) if number == 0 else _DEEP_LATER)
         if not inside.any() and masks.any():
             inside = depth >= np.median(depth[masks])
@@ -249,11 +250,26 @@ def _in_common(one: _Masks, other: _Masks) -> float:
 def _wrong(told: _Masks, said: _Masks) -> float:
     """The pixels of `told` [h, w] that are wrong by `said`, by the larger area of both; outlines that are the same but
     for `_SAME` are right."""
-    height, width = told.shape
-    reach = _SAME * max(1.0, max(height, width) / 240)
-    depth = _depth(told)
-    apart = (said & (depth < -reach)) | (~said & (depth > reach))
-    return float(apart.sum() / max(told.sum(), said.sum(), _LEAST_AREA * height * width))
+    return float(_apart(told, said).sum() / max(told.sum(), said.sum(), _LEAST_AREA * told.size))
+
+
+def _reach(mask: _Masks) -> float:
+    """Pixels within which outlines are the same."""
+    return _SAME * max(1.0, max(mask.shape) / 240)
+
+
+def _apart(told: _Masks, said: _Masks) -> _Masks:
+    """The pixels [h, w] of which one says that they are liquid, farther from the outline of `told` than `_SAME`."""
+    depth, reach = _depth(told), _reach(told)
+    return np.asarray((said & (depth < -reach)) | (~said & (depth > reach)))
+
+
+def _mended(told: _Masks, said: _Masks) -> _Masks:
+    """`told` with what `said` says where they are apart, and beside that; the rest of its outline stays."""
+    radius = int(np.ceil(_reach(told))) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    there = cv2.dilate(_apart(told, said).astype(np.uint8), disc).astype(bool)
+    return np.where(there, said, told)
 
 
 def _suspicious(wrong: NDArray[np.float64], middle: float) -> NDArray[np.bool_]:
@@ -285,11 +301,14 @@ def _replaced(scene: TrainingScene, name: str, sample: _Sample, answer: _Answer,
         right[t] = answer.evidence.mask(scene.image(name, t), plate, free, told)
         wrong[t] = _wrong(told, right[t])
         gained[t] = float(told.sum()) - float(right[t].sum())
-        length[t] = (np.abs(_depth(right[t])) < 1).sum() / 2
+        length[t] = max(1.0, (np.abs(_depth(right[t])) < 1).sum() / 2)
+        if wrong[t] <= _WRONG and abs(gained[t] / length[t]) < _reach(told):
+            # The outline of a mask with holes is better than that of photographs which hardly show the liquid.
+            right[t] = _mended(told, right[t])
     chosen = np.nonzero(_suspicious(wrong, middle))[0].tolist()
     if not chosen:
         return None
-    beyond = float(np.median(gained[chosen] / np.maximum(length[chosen], 1)))
+    beyond = float(np.median(gained[chosen] / length[chosen]))
     return Outlines(PackedMasks.of(told.shape, ((t, right[t]) for t in chosen)), scene.n_frames, beyond)
 
 

@@ -343,9 +343,6 @@ def fit_appearance(
         if schedule.due(iteration):
             schedule.look(iteration, loss_of_withheld())
         factor = schedule.factor(iteration)
-        if schedule.done(iteration) >= settings.coarse_share:
-            for target in targets:
-                target.coarse = None  # large, and not wanted any more
         if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
             if offer is not None and iteration >= shown_from:
                 offer(state, True)
@@ -353,6 +350,9 @@ def fit_appearance(
             settle = None
         if factor is None:
             break
+        if schedule.done(iteration) >= settings.coarse_share:
+            for target in targets:
+                target.coarse = None  # large, and not wanted any more
         if not queue:
             fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
