@@ -180,8 +180,7 @@ class SplashSplat(Method):
             with run.stage("self-calibration"):
                 calibration = self_calibration(scene, plates, lambda what: run.progress(0, what))
             if calibration:
-                for number, line in enumerate(calibration.lines(scene.cameras), 1):
-                    run.note("self-calibration" if number == 1 else f"self-calibration, {number}", line)
+                run.note("self-calibration", "; ".join(calibration.lines(scene.cameras)))
                 scene, known = calibration.scene(scene), None
                 plates = cache(lambda: clean_plates(scene))
         deferred = config.plates_share > 0 and config.composition != "together"

@@ -7,6 +7,7 @@ recorded status. CONTRIBUTING.md shows a complete method in one file.
 
 from __future__ import annotations
 
+import textwrap
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from splashbench.errors import SplashbenchError
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
-from splashbench.submission.identity import MAX_NOTE
+from splashbench.submission.identity import MAX_NOTE, MAX_NOTES
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -106,10 +107,13 @@ class Run:
     def note(self, name: str, text: str) -> None:
         """Write into record.json what the method found out by itself and went by, in a few words.
 
-        What is longer than `MAX_NOTE` characters goes on in notes called `name` 2, 3 and so on.
+        What is longer than `MAX_NOTE` characters goes on in notes called `name` 2, 3 and so on; beyond `MAX_NOTES` of
+        them nothing is kept.
         """
-        for number, start in enumerate(range(0, max(1, len(text)), MAX_NOTE), 1):
-            self.notes[name if number == 1 else f"{name} {number}"] = text[start : start + MAX_NOTE]
+        for number, part in enumerate(textwrap.wrap(text, MAX_NOTE) or [""], 1):
+            place = name if number == 1 else f"{name} {number}"
+            if place in self.notes or len(self.notes) < MAX_NOTES:
+                self.notes[place] = part
 
     @property
     def watched(self) -> bool:

@@ -93,6 +93,14 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     return np.sqrt(np.rint(distance**2)) - np.float32(0.5)
 
 
+def outline_distance(mask: np.ndarray) -> np.ndarray:
+    """Distance in pixels from the pixels of `mask` [h, w] to its outline, float32, below 0 outside it; infinite where
+    there is no outline."""
+    if not mask.any() or mask.all():
+        return np.full(mask.shape, np.inf if mask.any() else -np.inf, np.float32)
+    return np.where(mask, _inner(mask), -_inner(~mask)).astype(np.float32)
+
+
 def inner_distance(mask: np.ndarray) -> np.ndarray:
     """Distance in pixels from the pixels of `mask` [h, w] to its outline, float32, -0.5 outside it; see below."""
     return np.ascontiguousarray(_inner(np.pad(mask, 1))[1:-1, 1:-1])

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from splashbench.background.clean_plate import masked_median
+from splashbench.observe.silhouettes import outline_distance
 from splashbench.scene.scene import TrainingScene
 
 _Images = NDArray[np.uint8]
@@ -167,15 +168,14 @@ def _sample(scene: TrainingScene, name: str) -> _Sample:
     chosen = np.unique(np.linspace(0, scene.n_frames - 1, min(_FRAMES, scene.n_frames)).round().astype(int)).tolist()
     scale = min(1.0, _SIDE / max(camera.width, camera.height))
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    images = [scene.image(name, t) for t in chosen]
-    masks = [scene.mask(name, t) for t in chosen]
-    return _Sample(
-        tuple(chosen),
-        np.stack(
-            [image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
-        ),
-        np.stack([mask if scale == 1.0 else _resized(mask, size) for mask in masks]),
-    )
+    images = np.empty((len(chosen), size[1], size[0], 3), np.uint8)
+    masks = np.empty(images.shape[:3], bool)
+    # Shrunk one by one: large photographs do not fit into memory together.
+    for i, t in enumerate(chosen):
+        image, mask = scene.image(name, t), scene.mask(name, t)
+        images[i] = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        masks[i] = mask if scale == 1.0 else _resized(mask, size)
+    return _Sample(tuple(chosen), images, masks)
 
 
 def _resized(mask: _Masks, size: tuple[int, int]) -> _Masks:
@@ -191,7 +191,7 @@ def _asked(sample: _Sample, start: _Masks, rounds: int) -> _Answer:
     colors = _color_bins(sample.images)
     masks, evidence = start, None
     for number in range(rounds):
-        depth = np.stack([_depth(mask) for mask in masks])
+        depth = np.stack([outline_distance(mask) for mask in masks])
         pixels, share = _FAR if number == 0 else _FAR_LATER
         outside = depth < -max(pixels, share * longest)
         shown = masks.any(axis=(1, 2), keepdims=True)
@@ -226,7 +226,7 @@ def _trusted(sample: _Sample, answer: _Masks) -> bool:
     show as much of outlines as these."""
     if _outline(answer) < _AS_SHARP * _outline(sample.masks):
         return False
-    depth = np.stack([_depth(mask) for mask in sample.masks])
+    depth = np.stack([outline_distance(mask) for mask in sample.masks])
     met = []
     for beyond in _STARTS:
         start = depth > -beyond
@@ -238,7 +238,7 @@ def _trusted(sample: _Sample, answer: _Masks) -> bool:
 
 def _outline(masks: _Masks) -> float:
     """Pixels along the outlines of `masks` [F, h, w], by their area."""
-    along = sum(int((np.abs(_depth(mask)) < 1).sum()) for mask in masks)
+    along = sum(int((np.abs(outline_distance(mask)) < 1).sum()) for mask in masks)
     return along / max(1, int(masks.sum()))
 
 
@@ -260,7 +260,7 @@ def _reach(mask: _Masks) -> float:
 
 def _apart(told: _Masks, said: _Masks) -> _Masks:
     """The pixels [h, w] of which one says that they are liquid, farther from the outline of `told` than `_SAME`."""
-    depth, reach = _depth(told), _reach(told)
+    depth, reach = outline_distance(told), _reach(told)
     return np.asarray((said & (depth < -reach)) | (~said & (depth > reach)))
 
 
@@ -288,8 +288,8 @@ def _replaced(scene: TrainingScene, name: str, sample: _Sample, answer: _Answer,
     size = (camera.width, camera.height)
     same_size = sample.masks.shape[1:] == (camera.height, camera.width)
     known = answer.masks if same_size else np.stack([_resized(mask, size) for mask in answer.masks])
-    longest = max(size)
-    outside = np.stack([_depth(mask) for mask in known]) < -max(_FAR_LATER[0], _FAR_LATER[1] * longest)
+    far = max(_FAR_LATER[0], _FAR_LATER[1] * max(size))
+    outside = np.stack([outline_distance(mask) < -far for mask in known])
     free: _Masks = np.asarray(outside.any(axis=0))
     images = sample.images if same_size else np.stack([scene.image(name, t) for t in sample.frames])
     plate = masked_median(images, outside)
@@ -301,7 +301,7 @@ def _replaced(scene: TrainingScene, name: str, sample: _Sample, answer: _Answer,
         right[t] = answer.evidence.mask(scene.image(name, t), plate, free, told)
         wrong[t] = _wrong(told, right[t])
         gained[t] = float(told.sum()) - float(right[t].sum())
-        length[t] = max(1.0, (np.abs(_depth(right[t])) < 1).sum() / 2)
+        length[t] = max(1.0, (np.abs(outline_distance(right[t])) < 1).sum() / 2)
         if wrong[t] <= _WRONG and abs(gained[t] / length[t]) < _reach(told):
             # The outline of a mask with holes is better than that of photographs which hardly show the liquid.
             right[t] = _mended(told, right[t])
@@ -310,16 +310,6 @@ def _replaced(scene: TrainingScene, name: str, sample: _Sample, answer: _Answer,
         return None
     beyond = float(np.median(gained[chosen] / length[chosen]))
     return Outlines(PackedMasks.of(told.shape, ((t, right[t]) for t in chosen)), scene.n_frames, beyond)
-
-
-def _depth(mask: _Masks) -> NDArray[np.float32]:
-    """Pixels from the outline of `mask` [h, w], below 0 outside."""
-    if not mask.any() or mask.all():
-        return np.full(mask.shape, np.inf if mask.any() else -np.inf, np.float32)
-    inside, outside = (
-        cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (mask, ~mask)
-    )
-    return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
 
 
 @cache

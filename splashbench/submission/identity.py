@@ -15,9 +15,8 @@ _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 
 #: No cost of a run comes near; anything beyond is no measurement (and infinity is none either).
 _MAX_COST = 10**15
-_MAX_NOTES = 50
-#: Characters of a note in record.json, at most.
-MAX_NOTE = 500
+#: Characters of a note in record.json, and notes, at most.
+MAX_NOTE, MAX_NOTES = 500, 50
 #: Figures by the names that records and results had before version 0.2 -> today's names.
 RENAMED_FIGURES = {"carriers_per_frame": "particles_per_frame"}
 
@@ -106,7 +105,7 @@ class Record(BaseModel):
     #: seconds that saving them took, which fit_seconds leaves out; null where none were asked for
     checkpoint_seconds: float | None = Field(default=None, ge=0, le=_MAX_COST)
     #: what the method found out by itself and went by
-    notes: dict[str, Annotated[str, Field(max_length=MAX_NOTE)]] = Field(default_factory=dict, max_length=_MAX_NOTES)
+    notes: dict[str, Annotated[str, Field(max_length=MAX_NOTE)]] = Field(default_factory=dict, max_length=MAX_NOTES)
     render_fps: float | None = Field(default=None, ge=0, le=_MAX_COST)
     timed_frames: int | None = Field(default=None, ge=0)
     peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)

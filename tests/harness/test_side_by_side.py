@@ -43,6 +43,9 @@ def test_a_long_note_goes_on_in_others() -> None:
     assert [len(part) for part in run.notes.values()] == [500, 500, 200, 0]
     assert list(run.notes) == ["found", "found 2", "found 3", "nothing"]
     assert "".join(run.notes.values()) == text
+    run.note("flood", "word " * 10_000)
+    assert len(run.notes) == 50
+    assert run.notes["flood"].endswith("word")
 
 
 def test_they_run_at_the_same_time_where_there_are_cores(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from splashbench.selfcalibration import CalibratedScene, SelfCalibration, self_c
 from splashbench.selfcalibration.cameras import FittedCameras
 from splashbench.selfcalibration.clocks import Offset
 from splashbench.selfcalibration.exposure import Response
+from splashbench.selfcalibration.outlines import Outlines, PackedMasks
 from splashbench.selfcalibration.stance import Knock
 
 from .conftest import KNOCKED_AT, KNOCKED_BY, LATE, STOPS, photograph, turned
@@ -118,6 +119,21 @@ def test_masks_go_back_to_where_the_camera_would_have_seen_them(wrong: Scene) ->
     container = right.container_mask("3")
     assert container is not None
     assert container.all()
+
+
+def test_masks_that_were_found_stand_for_those_told(balls: Scene) -> None:
+    told = balls.training()
+    shape = told.mask("1", 0).shape
+    mended = np.zeros(shape, bool)
+    mended[3:9, 5:7] = True
+    found = SelfCalibration(outlines={"1": Outlines(PackedMasks.of(shape, [(2, mended)]), told.n_frames, -1.5)})
+    right = found.scene(told)
+    np.testing.assert_array_equal(right.mask("1", 2), mended)
+    np.testing.assert_array_equal(right.mask("1", 1), told.mask("1", 1))
+    np.testing.assert_array_equal(right.mask("2", 2), told.mask("2", 2))
+    np.testing.assert_array_equal(right.image("1", 2), told.image("1", 2))
+    (line,) = found.lines(told.cameras)
+    assert line.startswith(f"camera 1: 1 of {told.n_frames} masks are not what its photographs show (timesteps 2)")
 
 
 def test_where_nothing_was_found_a_scene_is_itself(balls: Scene) -> None:

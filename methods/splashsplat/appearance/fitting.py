@@ -350,7 +350,7 @@ def fit_appearance(
             settle = None
         if factor is None:
             break
-        if schedule.done(iteration) >= settings.coarse_share:
+        if targets[0].coarse is not None and schedule.done(iteration) >= settings.coarse_share:
             for target in targets:
                 target.coarse = None  # large, and not wanted any more
         if not queue:
