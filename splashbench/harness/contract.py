@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from splashbench.errors import SplashbenchError
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+from splashbench.submission.decisions import MAX_DECISIONS, Decision
 from splashbench.submission.identity import MAX_NOTE, MAX_NOTES
 
 T = TypeVar("T")
@@ -63,6 +64,7 @@ class Run:
         reused: parts that came from there, and the seconds their fit took in an earlier run.
         stages: seconds of the fit's stages, see `stage`.
         notes: what the method found out and went by, see `note`.
+        decisions: what the method decided by itself, see `decide`.
     """
 
     seed: int = 0
@@ -73,6 +75,7 @@ class Run:
     reused: dict[str, float] = field(default_factory=dict)
     stages: dict[str, float] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+    decisions: list[Decision] = field(default_factory=list)
     _overhead_seconds: float = 0.0
     _inner_seconds: float = 0.0
     _told: float = 0.0
@@ -114,6 +117,14 @@ class Run:
             place = name if number == 1 else f"{name} {number}"
             if place in self.notes or len(self.notes) < MAX_NOTES:
                 self.notes[place] = part
+
+    def decide(self, decision: Decision) -> None:
+        """Write into record.json what the method decided by itself, and by what evidence.
+
+        Beyond `MAX_DECISIONS` of them nothing is kept.
+        """
+        if len(self.decisions) < MAX_DECISIONS:
+            self.decisions.append(decision)
 
     @property
     def watched(self) -> bool:

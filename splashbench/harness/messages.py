@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from splashbench.submission import Status
+from splashbench.submission import Decision, Status
 
 
 class Request(BaseModel):
@@ -67,6 +67,7 @@ class Outcome(BaseModel):
     reused: dict[str, float] = {}
     stages: dict[str, float] = {}
     notes: dict[str, str] = {}
+    decisions: list[Decision] = []
     checkpoints: list[float] = []
     checkpoint_seconds: float | None = None
     render_fps: float | None = None

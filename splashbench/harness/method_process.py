@@ -105,6 +105,7 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
         reused=run.reused,
         stages=run.stages,
         notes=run.notes,
+        decisions=run.decisions,
         settings=config.model_dump(mode="json"),
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),

@@ -199,6 +199,7 @@ def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
                     "reused": outcome.reused,
                     "stages": outcome.stages,
                     "notes": outcome.notes,
+                    "decisions": outcome.decisions,
                     "checkpoint_seconds": outcome.checkpoint_seconds,
                     "storage_bytes": storage,
                     "dynamic_bytes": storage - static,

@@ -32,9 +32,16 @@ class _Part:
         self.fraction, self.message, self.seconds = 0.0, "", 0.0
         self._report, self._failed = report, failed
         self.run = replace(
-            run, reused={}, stages={}, notes={}, _overhead_seconds=0.0, _inner_seconds=0.0, _report=self.hear,
+            run,
+            reused={},
+            stages={},
+            notes={},
+            decisions=[],
+            _overhead_seconds=0.0,
+            _inner_seconds=0.0,
+            _report=self.hear,
             _checkpoints=None,
-        )  # fmt: skip
+        )
 
     def hear(self, fraction: float, message: str) -> None:
         if self._failed.is_set():
@@ -78,6 +85,8 @@ def side_by_side(
     for part in parts:
         run.reused.update(part.run.reused)
         run.notes.update(part.run.notes)
+        for decision in part.run.decisions:
+            run.decide(decision)
         for name, seconds in part.run.stages.items():
             run.stages[name] = run.stages.get(name, 0.0) + seconds
     # `fit_seconds` takes the wall time and adds what was reused: what is over `took` is to go.

@@ -105,6 +105,7 @@ def score_submission(
         checkpoints=checkpoints,
         stages=dict(submission.record.stages),
         notes=dict(submission.record.notes),
+        decisions=list(submission.record.decisions),
         claimed={name: value for name, value in identity.claimed.items() if math.isfinite(value)},
         hardware=identity.hardware,
         times_source=scene.times_source,

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from splashbench.files import read_model, write_model
 from splashbench.score.metrics import METRICS, Better
 from splashbench.score.settings import Protocol
-from splashbench.submission import with_current_names
+from splashbench.submission import Decision, with_current_names
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.+-]+")
 
@@ -82,7 +82,8 @@ class Result(_Frozen):
         overrides: KEY=VALUE, settings that were given on top of the preset.
         told: what the scene states besides images, masks and cameras (`Scene.stated`); None where it was not noted.
         checkpoints: the fit on its way, in the order of time.
-        stages, notes: of the submission's record: seconds of the fit's phases, and what the method found out.
+        stages, notes, decisions: of the submission's record: seconds of the fit's phases, what the method found out,
+            and what it decided by itself.
     """
 
     schema_version: Literal[1] = 1
@@ -105,6 +106,7 @@ class Result(_Frozen):
     checkpoints: tuple[CheckpointScore, ...] = ()
     stages: dict[str, float] = Field(default_factory=dict)
     notes: dict[str, str] = Field(default_factory=dict)
+    decisions: list[Decision] = Field(default_factory=list)
     claimed: dict[str, float] = Field(default_factory=dict)
     hardware: dict[str, Any] = Field(default_factory=dict)
     times_source: str = ""

@@ -1,5 +1,6 @@
 """Submissions: what a method hands in. Writing, reading and checking them."""
 
+from splashbench.submission.decisions import Decision, Rung
 from splashbench.submission.identity import (
     PROTOCOL,
     RENAMED_FIGURES,
@@ -24,8 +25,10 @@ __all__ = [
     "PROTOCOL",
     "RENAMED_FIGURES",
     "Checkpoint",
+    "Decision",
     "Identity",
     "Record",
+    "Rung",
     "Status",
     "Submission",
     "check_submission",

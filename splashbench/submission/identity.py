@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from splashbench.submission.decisions import MAX_DECISIONS, Decision
 from splashbench.submission.withheld import Withheld
 
 PROTOCOL: Literal["v1"] = "v1"
@@ -106,6 +107,8 @@ class Record(BaseModel):
     checkpoint_seconds: float | None = Field(default=None, ge=0, le=_MAX_COST)
     #: what the method found out by itself and went by
     notes: dict[str, Annotated[str, Field(max_length=MAX_NOTE)]] = Field(default_factory=dict, max_length=MAX_NOTES)
+    #: what the method decided by itself, in the order in which it did
+    decisions: list[Decision] = Field(default_factory=list, max_length=MAX_DECISIONS)
     render_fps: float | None = Field(default=None, ge=0, le=_MAX_COST)
     timed_frames: int | None = Field(default=None, ge=0)
     peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)

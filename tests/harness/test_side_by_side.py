@@ -10,6 +10,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.harness import side_by_side
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
+from splashbench.submission import Decision, Record, Rung
 
 
 @pytest.fixture(params=[1, 2], ids=["one core", "two cores"])
@@ -27,12 +28,24 @@ def test_both_results_and_all_that_was_noted_come_back(cores: int) -> None:
     def second(run: Run) -> int:
         with run.stage("both"):
             run.note("b", f"seed {run.seed}")
+            run.decide(Decision(name="size", basis="scene", chosen="8", because="it is enough"))
         return 2
 
     run = Run(seed=7)
     assert run.side_by_side(first, second) == ("one", 2)
     assert run.notes == {"a": "1", "b": "seed 7"}
+    assert [decision.chosen for decision in run.decisions] == ["8"]
     assert set(run.stages) == {"both", "first"}
+
+
+def test_decisions_and_their_rungs_are_bounded() -> None:
+    run = Run()
+    rungs = [Rung(value=str(n), bought=False) for n in range(40)]
+    for n in range(60):
+        run.decide(Decision(name=str(n), basis="withheld", chosen="0", because="", rungs=rungs))
+    assert len(run.decisions) == 50
+    assert len(run.decisions[0].rungs) == 40
+    Record(decisions=run.decisions)
 
 
 def test_a_long_note_goes_on_in_others() -> None:

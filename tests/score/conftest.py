@@ -53,7 +53,7 @@ class FakeSubmission:
     @property
     def record(self) -> SimpleNamespace:
         measured = {"fit_seconds": 12.5, "peak_memory_bytes": 1 << 20} if self.status == "ok" else {}
-        return SimpleNamespace(**(dict.fromkeys(_COSTS) | measured), checkpoints=[], stages={}, notes={})
+        return SimpleNamespace(**(dict.fromkeys(_COSTS) | measured), checkpoints=[], stages={}, notes={}, decisions=[])
 
     @property
     def digest(self) -> str:
