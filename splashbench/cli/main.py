@@ -27,8 +27,8 @@ from splashbench.version import __version__
 
 #: In the order of the work: session, scene, method, submission, result.
 COMMANDS = (
-    *("demo", "synth", "prepare", "masks", "scene", "methods", "run", "run-external", "check", "score"),
-    *("leaderboard", "study"),
+    *("demo", "synth", "prepare", "masks", "scene", "methods", "run", "run-external", "check", "explain"),
+    *("score", "leaderboard", "study"),
 )
 
 _EPILOG = """\
@@ -37,6 +37,7 @@ the usual order:
   splashbench synth session SESSION                 a synthetic recording with exact ground truth
   splashbench prepare SESSION SCENE                 calibrate, synchronise, mask, crop
   splashbench run splashsplat SCENE SUBMISSION      reconstruct
+  splashbench explain SUBMISSION                    why the fit is as large and as slow as it is
   splashbench score SUBMISSION --scene SCENE --out RESULTS
   splashbench leaderboard RESULTS OUT               CSV, table and charts
   splashbench study run ablation OUT --scenes SCENE     many runs in one table

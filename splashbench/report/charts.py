@@ -18,16 +18,18 @@ from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, safe for colour-blind readers, without its black and its pale yellow; shapes differ as well.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+#: Okabe and Ito's palette, safe for colour-blind readers, without its black and its pale yellow; shapes differ as well.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _SHAPES = ("o", "s", "^", "D", "v", "P")
-_GREY = "#666666"
+GREY = "#666666"
 _ORACLE = "oracle"
 _GIB = 2.0**30
 _MIN_AREA, _MAX_AREA = 30.0, 420.0
 _TICKS = tuple((n * unit, f"{n} {name}") for unit, name in ((1, "s"), (60, "min"), (3600, "h")) for n in (1, 3, 10, 30))
-_STYLE: dict[str, Any] = {
+#: Of every chart of a report, for matplotlib.rc_context.
+STYLE: dict[str, Any] = {
     "svg.hashsalt": "splashbench",
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -53,11 +55,11 @@ def speed_accuracy_chart(sources: Sequence[ResultFile], out: Path, with_paper: b
     rows = machines(sources) + ([reported_machine()] if with_paper else [])
     methods = sorted({entry.label for row in rows for entry in row.entries})
     looks = {
-        label: (_COLOURS[i % len(_COLOURS)], _SHAPES[(i + i // len(_COLOURS)) % len(_SHAPES)])
+        label: (COLOURS[i % len(COLOURS)], _SHAPES[(i + i // len(COLOURS)) % len(_SHAPES)])
         for i, label in enumerate(methods)
     }
     largest = max((memory for row in rows for e in row.entries if (memory := e.memory_bytes())), default=_GIB)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 0.9 + 3.7 * len(rows)), layout="constrained")
         axes = figure.subplots(len(rows), 2, squeeze=False)
         for row, (left, right) in zip(rows, axes):
@@ -67,10 +69,17 @@ def speed_accuracy_chart(sources: Sequence[ResultFile], out: Path, with_paper: b
         figure.suptitle("Speed against accuracy, test views", x=0.01, ha="left", fontsize=12, fontweight="bold")
         _legend(figure, looks, largest, any(row.reported for row in rows), _filtered(rows))
         paths = [Path(out, "speed_accuracy.png"), Path(out, "speed_accuracy.svg")]
-        for path, metadata in zip(paths, ({"Software": None}, {"Date": None, "Creator": None})):
-            with atomic_path(path) as temporary:
-                figure.savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata, facecolor="white")
+        for path in paths:
+            save_figure(figure, path)
     return paths
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write `figure` to `path`, .png or .svg, without a date. Call it within the figure's style."""
+    kind = path.suffix[1:].lower()
+    metadata = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=kind, dpi=150, metadata=metadata, facecolor="white")
 
 
 def _panel(axes: Axes, row: Machine, name: str, looks: dict[str, tuple[str, str]], largest: float) -> None:
@@ -94,7 +103,7 @@ def _panel(axes: Axes, row: Machine, name: str, looks: dict[str, tuple[str, str]
     _draw_failures(axes, row, higher)
     if not summaries:
         axes.text(
-            0.5, 0.5, f"no run has {metric.title} and a fit time", transform=axes.transAxes, ha="center", color=_GREY
+            0.5, 0.5, f"no run has {metric.title} and a fit time", transform=axes.transAxes, ha="center", color=GREY
         )
     axes.set_xlabel("fit time, log scale (← faster)")
     axes.set_ylabel(f"{label(metric, arrow=False)}, {'higher is better →' if higher else '← lower is better'}")
@@ -164,7 +173,7 @@ def _draw_controls(axes: Axes, row: Machine, name: str) -> None:
     for method, figures in row.controls.items():
         if name not in figures or not _on_scale(method, name):
             continue
-        axes.axhline(figures[name], color=_GREY, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
+        axes.axhline(figures[name], color=GREY, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
         axes.annotate(
             f"control: {method}",
             (1.0, figures[name]),
@@ -174,7 +183,7 @@ def _draw_controls(axes: Axes, row: Machine, name: str) -> None:
             ha="right",
             va="bottom",
             fontsize=7.5,
-            color=_GREY,
+            color=GREY,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
         )
 
@@ -210,14 +219,14 @@ def _legend(figure: Any, looks: dict[str, tuple[str, str]], largest: float, repo
         mark(shape, 60, color=colour, markeredgewidth=0, label=label + (FILTER_MARK if label in filtered else ""))
         for label, (colour, shape) in looks.items()
     ]
-    handles.append(mark("o", 12, color=_GREY, alpha=0.4, markeredgewidth=0, label="one run"))
+    handles.append(mark("o", 12, color=GREY, alpha=0.4, markeredgewidth=0, label="one run"))
     handles.append(Line2D([], [], color="#AAAAAA", linewidth=1.2, drawstyle="steps-post", label="Pareto front"))
     for share in (0.25, 1.0):
         label = f"{largest * share / _GIB:.2g} GiB peak memory (area)"
         area = _area(largest * share, largest)
-        handles.append(mark("o", area, markerfacecolor="none", markeredgecolor=_GREY, label=label))
+        handles.append(mark("o", area, markerfacecolor="none", markeredgecolor=GREY, label=label))
     if reported:
-        hollow = mark("s", 60, markerfacecolor="none", markeredgecolor=_GREY, label="hollow: as reported by the paper")
+        hollow = mark("s", 60, markerfacecolor="none", markeredgecolor=GREY, label="hollow: as reported by the paper")
         handles.append(hollow)
     legend = figure.legend(
         handles=handles, loc="outside lower left", ncols=4, frameon=False, fontsize=8, labelspacing=1.0

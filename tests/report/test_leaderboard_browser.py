@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from splashbench.files import read_image
+from splashbench.submission import Decision, Rung
 
 PageOf = Callable[..., str]
 DataOf = Callable[[str], dict[str, Any]]
@@ -238,6 +239,27 @@ def test_a_row_opens_its_command_and_record(results: Path, browser: str, tmp_pat
     )
     assert "told: times" in found["text"]
     assert found["stages"] == 4
+
+
+def test_a_run_shows_its_decisions_as_text(make_result: Any, browser: str, tmp_path: Path, page_of: PageOf) -> None:
+    hostile = "<img src=x onerror=\"faults.push('ran')\"><b>"
+    rungs = [Rung(value=f"{n} steps", bought=n < 2, gain=0.5, reason=hostile) for n in range(3)]
+    decisions = [Decision(name=hostile, basis="withheld", chosen="1 steps", because=hostile, rungs=rungs)]
+    make_result("alpha", decisions=decisions * 21, psnr=20.0, fit_seconds=9.0).save(tmp_path / "results")
+    script = """document.querySelector("#rows tbody button").click();
+    const box = document.getElementById("details"), first = box.querySelector(".decision");
+    await new Promise(resolve => setTimeout(resolve, 300));
+    return { images: document.querySelectorAll("img, b").length, decisions: box.querySelectorAll(".decision").length,
+      held: first.querySelector("tr.held").cells[0].textContent, rows: first.querySelectorAll("tr").length,
+      last: first.querySelectorAll("tr")[3].cells[2].textContent, more: box.textContent.includes("left out: 1") };"""
+    assert browse(browser, page_of(tmp_path / "results"), tmp_path, script) == {
+        "images": 0,
+        "decisions": 20,
+        "held": "1 steps",
+        "rows": 4,
+        "last": f"refused: {hostile}",
+        "more": True,
+    }
 
 
 def test_strangers_names_are_shown_as_text(

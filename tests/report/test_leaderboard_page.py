@@ -1,5 +1,6 @@
 """The leaderboard's page: what it holds, that it needs nothing but itself, and how it behaves in a browser."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from splashbench.report.results import load_results
 from splashbench.report.table import leaderboard_table, to_csv
 from splashbench.score.result import Result
 from splashbench.score.settings import PROTOCOL_V1
+from splashbench.submission import Decision, Rung
 
 PageOf = Callable[..., str]
 DataOf = Callable[[str], dict[str, Any]]
@@ -40,6 +42,24 @@ def test_names_from_strangers_stay_text(make_result: Any, tmp_path: Path, page_o
     page = page_of(tmp_path / "results")
     assert "<img src=x" not in page
     assert data_of(page)["rows"][0]["scene"] == hostile
+
+
+def test_decisions_are_text_and_bounded(make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf) -> None:
+    hostile = "</script><img src=x onerror=alert(1)>\x1b[1m\n"
+    rungs = [Rung(value=f"{n} {hostile}", bought=n < 2, gain=0.5, reason=hostile * 10) for n in range(40)]
+    decision = Decision(name=hostile, basis="withheld", chosen=hostile, because=hostile * 10, rungs=rungs)
+    make_result("alpha", decisions=[decision] * 70, psnr=20.0, fit_seconds=9.0).save(tmp_path / "results")
+    page = page_of(tmp_path / "results")
+    assert "<img src=x" not in page
+    (run,) = data_of(page)["runs"]
+    assert len(run["decisions"]) + run["decisions_left_out"] == 70
+    first = run["decisions"][0]
+    assert len(first["rungs"]) + first["rungs_left_out"] == 40
+    assert first["header"] == ["value", "gain ± s.e.", ""]
+    assert first["rungs"][0][:2] == ["0 </script><img src=x onerror=alert(1)>…", "+0.5"]
+    assert first["held"] == 1
+    assert len(json.dumps(run)) < 200_000
+    assert all(text.isprintable() for rung in first["rungs"] for text in rung)
 
 
 def test_failed_runs_and_machines_are_kept_apart(results: Path, page_of: PageOf, data_of: DataOf) -> None:

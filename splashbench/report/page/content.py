@@ -22,11 +22,13 @@ from splashbench.report.anytime import (
     hypervolumes,
     standings,
 )
+from splashbench.report.decision_text import BASES, chosen_rung, rung_table, shortened
 from splashbench.report.groups import Entry, Group, comparable, told_text
 from splashbench.score.metrics import METRICS
 from splashbench.score.notation import FILTER_MARK, in_shown_unit, label, shown
 from splashbench.score.result import Result
 from splashbench.statistics import Estimate, estimate
+from splashbench.submission import Decision
 
 #: Metrics of the table, of the charts' axes, and of a run's details.
 TABLE = ("psnr", "lpips", "ssim", "miou", "spill", "jitter_error", "fit_seconds", "peak_memory_bytes", "storage_bytes")
@@ -34,6 +36,8 @@ COSTS = ("fit_seconds", "peak_memory_bytes", "storage_bytes", "render_fps", "pri
 QUALITIES = (*QUALITY, "dpsnr_bg", "ssim", "spill", "jitter_error", "uniformity")
 _SHOWN = tuple(dict.fromkeys((*TABLE, *COSTS, *QUALITIES)))
 _DIGITS = 6
+#: Of a run in the page, and rungs of a decision; `splashbench explain` shows all.
+MAX_DECISIONS, MAX_RUNGS = 20, 15
 
 
 def metric_facts() -> dict[str, dict[str, Any]]:
@@ -162,6 +166,8 @@ def run_facts(result: Result, group: int, label: str, scene: str, path: str) -> 
         "course": course,
         "stages": {name: rounded(seconds) for name, seconds in result.stages.items()},
         "notes": result.notes,
+        "decisions": [_decision(decision) for decision in result.decisions[:MAX_DECISIONS]],
+        "decisions_left_out": max(0, len(result.decisions) - MAX_DECISIONS),
         "file": path,
         "command": command(result),
         "submission": result.digests.submission[:12],
@@ -170,6 +176,21 @@ def run_facts(result: Result, group: int, label: str, scene: str, path: str) -> 
             if result.status == "ok"
             else ()
         ),
+    }
+
+
+def _decision(decision: Decision) -> dict[str, Any]:
+    """A decision with its first `MAX_RUNGS` rungs as text: a page holds many runs, some of them strangers'."""
+    table = rung_table(decision, 150)
+    chosen = chosen_rung(decision)
+    return {
+        "name": shortened(decision.name, 60),
+        "chosen": shortened(decision.chosen, 100),
+        "because": f"{BASES[decision.basis]}: {shortened(decision.because, 250)}".rstrip(": "),
+        "header": [*table.header, ""],
+        "rungs": [[*row, verdict] for row, verdict in zip(table.rows[:MAX_RUNGS], table.verdicts)],
+        "held": chosen,
+        "rungs_left_out": max(0, len(table.rows) - MAX_RUNGS),
     }
 
 

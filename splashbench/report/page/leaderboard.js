@@ -278,6 +278,7 @@ function show(numbers, row) {
     if (figures.length) box.append(element("p", figures.join(" · ")));
     stages(box, one);
     for (const [name, text] of Object.entries(one.notes)) box.append(element("p", `${name}: ${text}`, { class: "note" }));
+    decisions(box, one);
     for (const reason of one.missing) box.append(element("p", `no figure: ${reason}`, { class: "note" }));
     if (one.sheet) box.append(element("img", null, { src: one.sheet, alt: `truth, render and opacity of ${one.label}, seed ${one.seed}`, loading: "lazy" }));
     box.append(element("p", `result ${one.file}, submission ${one.submission}`, { class: "note" }));
@@ -289,6 +290,22 @@ function show(numbers, row) {
     box.append(more);
   }
   byId("details").showModal();
+}
+function decisions(box, run) {
+  for (const decision of run.decisions) {
+    const made = element("details", null, { class: "decision" }), table = element("table"), head = element("tr");
+    made.append(element("summary", `${decision.name}: ${decision.chosen}`), element("p", decision.because, { class: "note" }));
+    head.append(...decision.header.map(title => element("th", title, { scope: "col" })));
+    table.append(head, ...decision.rungs.map((cells, n) => {
+      const row = element("tr", null, n === decision.held ? { class: "held", title: "chosen" } : {});
+      row.append(...cells.map(cell => element("td", cell)));
+      return row;
+    }));
+    if (decision.rungs.length) made.append(table);
+    if (decision.rungs_left_out) made.append(element("p", `rungs left out: ${decision.rungs_left_out}`, { class: "note" }));
+    box.append(made);
+  }
+  if (run.decisions_left_out) box.append(element("p", `decisions left out: ${run.decisions_left_out}`, { class: "note" }));
 }
 function stages(box, run) {
   const parts = Object.entries(run.stages).filter(([, s]) => s > 0), total = parts.reduce((sum, [, s]) => sum + s, 0);
