@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clean_plate, make_clean_plates
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_path, read_npz
+from splashbench.files import read_npz, write_npz
 from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench.gaussians.initialization import hull_points
 from splashbench.gaussians.torch_threads import one_torch_thread
@@ -20,7 +20,7 @@ from splashbench.render import rasterize_arrays
 from splashbench.scene import Camera, TrainingScene
 
 from .fitting import fit_model, supervised_anchors
-from .model import AnchorModel, StaticAnchorSpec, to_arrays
+from .model import AnchorModel, StaticAnchorSpec, from_arrays, round_to_stored, to_arrays
 from .settings import BackgroundSettings
 
 _FILE = "background.npz"
@@ -36,7 +36,8 @@ class Background:
     """A fitted static scene. `far_color` [3] is what shows where no Gaussian lies."""
 
     def __init__(self, model: AnchorModel, far_color: NDArray[np.float32]) -> None:
-        self.model = model.eval()
+        # As it is stored: a saved background renders the same.
+        self.model = round_to_stored(model).eval()
         self.far_color = np.asarray(far_color, dtype=np.float32)
 
     def gaussians(self, camera: Camera) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -70,8 +71,7 @@ class Background:
     def save(self, directory: Path) -> None:
         """Write background.npz into `directory` (made where absent)."""
         variant = {name: np.array(value) for name, value in vars(self.model.variant).items()}
-        with atomic_path(Path(directory) / _FILE) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, far_color=self.far_color, **variant, **to_arrays(self.model))
+        write_npz(Path(directory) / _FILE, {"far_color": self.far_color, **variant, **to_arrays(self.model)})
 
     @classmethod
     def load(cls, directory: Path) -> Background:
@@ -89,7 +89,7 @@ class Background:
         state = model.state_dict()
         arrays = read_npz(path, {name: tensor.ndim for name, tensor in state.items()})
         try:
-            model.load_state_dict({name: torch.as_tensor(array) for name, array in arrays.items()})
+            from_arrays(model, arrays)
         except RuntimeError:
             raise SplashbenchError(f"{path}: its arrays do not fit together; fit the background again") from None
         return cls(model, fixed["far_color"])

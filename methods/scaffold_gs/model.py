@@ -15,6 +15,7 @@ at the point's own colour, so that hundreds of iterations suffice instead of ten
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -143,6 +144,36 @@ def first_offsets(n: int, children: int, dimensions: int, spread: bool) -> torch
     return torch.rand(n, children, dimensions) * 1.4 - 0.7
 
 
+#: Steps in which these tables are stored, in the units of their exponent or sigmoid. Steps are powers of two, so that
+#: rounding once more changes nothing.
+STORED_STEPS = {"features": 2.0**-6, "offsets": 2.0**-7, "log_scales": 2.0**-6}
+
+
+@torch.no_grad()
+def round_to_stored(model: AnchorModel) -> AnchorModel:
+    """`model` with its tables rounded, in place, to the steps in which they are stored."""
+    for name, step in STORED_STEPS.items():
+        table = getattr(model, name)
+        table.copy_(torch.round(table / step).clamp(-32767, 32767) * step)
+    return model
+
+
 def to_arrays(model: AnchorModel) -> dict[str, np.ndarray]:
-    """Every parameter and buffer by name."""
-    return {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
+    """Every parameter and buffer by name; the tables of `STORED_STEPS` as whole numbers of steps, int16."""
+    arrays = {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
+    whole = {name: np.rint(arrays[name] / step).astype(np.int16) for name, step in STORED_STEPS.items()}
+    return arrays | {
+        name: steps.astype(np.int8) if np.abs(steps).max(initial=0) < 128 else steps for name, steps in whole.items()
+    }
+
+
+def from_arrays(model: AnchorModel, arrays: Mapping[str, np.ndarray]) -> AnchorModel:
+    """`model` with what `to_arrays` gave, or with tables as floats. Raises RuntimeError where they do not fit it."""
+    floats = {
+        name: array.astype(np.float32) * np.float32(STORED_STEPS[name] if array.dtype.kind == "i" else 1)
+        if name in STORED_STEPS
+        else array
+        for name, array in arrays.items()
+    }
+    model.load_state_dict({name: torch.as_tensor(array) for name, array in floats.items()})
+    return model

@@ -1,41 +1,44 @@
 """The liquid as fitted: carriers, motion, signed distance and appearance, with its files.
 
-Everything is held in the precision in which it is stored, so that a loaded model renders the same image, bit for bit.
+A liquid is made of what is stored of it, so that a loaded model renders the same image, bit for bit. storage/FORMAT.md
+describes the files.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-import torch
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_json, read_npz, write_json
+from splashbench.files import compressed_bytes, read_json, read_npz, write_json, write_npz
 from splashbench.observe.grid import Grid
 from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles
 
 from .appearance.decoder import Decoder, DecoderSettings
 from .appearance.fitting import Appearance, Composition
-from .appearance.glass import Glass
+from .appearance.sensitivity import Sensitivity
 from .carriers.between import BetweenFrames
 from .carriers.population import Carriers
 from .carriers.subframe import Track
-from .motion.fall import falls_of, table_of
 from .motion.steps import Motion
 from .motion.velocity import Factor
+from .storage.earlier import EARLIER, read_earlier
+from .storage.looks import appearance_arrays, appearance_ranks, learned_values, read_appearance
+from .storage.track import CARRIERS, DEFORMATION, DISTANCE, MOTION, read_track, track_arrays
 
-# Of models with glass; readers of before would leave it out and not say so.
-FORMAT, FORMAT_WITHOUT_GLASS = 4, 3
-_GLASS = "glass."
-_GLASS_RANKS = {"positions": 2, "log_scales": 2, "quaternions": 2, "opacities": 1, "colors": 2, "slopes": 3}
+T = TypeVar("T")
 
-
-def _position_steps(grid: Grid) -> float:
-    """16-bit steps per transport voxel."""
-    return 65535 / max(grid.shape)
+FORMAT = 5
+# Step in which values are stored where nothing is known of the photographs, of their spread.
+_UNKNOWN_STEP = 0.05
+_AGAIN = "fit the scene again"
+# The files, and what each is called where it is at fault.
+_FILES = ("carriers", "motion", "distance", "appearance")
 
 
 def _factor(stored: int | list[float]) -> Factor:
@@ -46,18 +49,6 @@ def _factor(stored: int | list[float]) -> Factor:
     return fx, fy, fz
 
 
-def store_precision(carriers: Carriers, grid: Grid) -> Carriers:
-    """Carriers rounded to what the files hold: 16-bit fixed-point positions, half-precision F and phi."""
-    steps = _position_steps(grid)
-    positions = np.round(np.clip(carriers.positions * steps, 0, 65535)) / np.float32(steps)
-    return replace(
-        carriers,
-        positions=positions.astype(np.float32),
-        deformation=carriers.deformation.astype(np.float16).astype(np.float32),
-        phi=carriers.phi.astype(np.float16).astype(np.float32),
-    )
-
-
 @dataclass
 class Liquid:
     """The dynamic foreground.
@@ -65,7 +56,8 @@ class Liquid:
     times: [T] seconds. grid: the transport grid. carriers, motion: in the precision of the files. phi: int8 [T, nx, ny,
     nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers. composition: how it was
     fitted and is drawn: "over" an image of the background, or "together" with the background's Gaussians.
-    between_frames: whose carriers are drawn there, see carriers/between.py.
+    between_frames: whose carriers are drawn there, see carriers/between.py. arrays: what is stored, by file and name;
+    none of a model of an earlier version.
     """
 
     times: np.ndarray
@@ -77,24 +69,48 @@ class Liquid:
     carried: bool = True
     composition: Composition = "over"
     between_frames: BetweenFrames = "both"
+    arrays: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls,
         times: np.ndarray,
-        grid: Grid,
-        carriers: Carriers,
-        motion: Motion,
-        phi: np.ndarray,
+        track: Track,
         appearance: Appearance,
         carried: bool = True,
         composition: Composition = "over",
         between_frames: BetweenFrames = "both",
+        sensitivity: Sensitivity | None = None,
+        step: float = _UNKNOWN_STEP,
     ) -> Liquid:
-        """Bring the learned tables and the motion to the precision of the files."""
-        halves = [table.half().float() for table in (appearance.features, appearance.log_scales)]
-        appearance = Appearance(halves[0], halves[1], appearance.decoder, appearance.glass)
-        return cls(times, grid, carriers, motion.half(), phi, appearance, carried, composition, between_frames)
+        """Bring the appearance to the precision of the files. track: in this precision already, see `stored_track`.
+
+        sensitivity: of the photographs to the appearance; without it, values are stored in shares of their spread.
+        step: see `store_values`.
+        """
+        known = Sensitivity.of_spread(learned_values(appearance)) if sensitivity is None else sensitivity
+        arrays = {
+            **track_arrays(track, carried),
+            "appearance": appearance_arrays(appearance, known, step, track.grid),
+        }
+        look = read_appearance(arrays["appearance"], Decoder(appearance.decoder.settings), track.grid)
+        return cls._of_parts(times, track, look, carried, composition, between_frames, arrays)
+
+    @classmethod
+    def _of_parts(
+        cls,
+        times: np.ndarray,
+        track: Track,
+        appearance: Appearance,
+        carried: bool,
+        composition: Composition,
+        between_frames: BetweenFrames,
+        arrays: Mapping[str, Mapping[str, np.ndarray]],
+    ) -> Liquid:
+        carriers, motion = track.carriers, track.motion
+        return cls(
+            times, track.grid, carriers, motion, track.phi, appearance, carried, composition, between_frames, arrays
+        )
 
     @property
     def track(self) -> Track:
@@ -126,11 +142,17 @@ class Liquid:
         """phi_t of every frame on the transport grid; None where that is more than a submission may hold."""
         return None if self.phi.nbytes > MAX_BYTES else SignedDistance(self.phi, self.grid.origin, self.grid.voxel)
 
+    @property
+    def stored_bytes(self) -> int:
+        """How much `save` writes, to within some kilobytes."""
+        return sum(compressed_bytes(arrays) for arrays in self.arrays.values())
+
     def save(self, directory: Path) -> None:
         """Write liquid.json and four .npz files into `directory`."""
-        settings = self.appearance.decoder.settings
+        if not self.arrays:
+            raise SplashbenchError(f"a model of an earlier version cannot be written again; {_AGAIN}")
         header = {
-            "format": FORMAT_WITHOUT_GLASS if self.appearance.glass is None else FORMAT,
+            "format": FORMAT,
             "times": [float(t) for t in self.times],
             "grid": {
                 "origin": [float(x) for x in self.grid.origin],
@@ -138,35 +160,15 @@ class Liquid:
                 "shape": list(self.grid.shape),
             },
             "factor": self.motion.factor,
-            "carriers": self.carriers.count,
             "carried": self.carried,
             "composition": self.composition,
             "between_frames": self.between_frames,
-            "decoder": dict(vars(settings)),
+            "glass": self.appearance.glass is not None,
+            "decoder": dict(vars(self.appearance.decoder.settings)),
         }
         write_json(directory / "liquid.json", header)
-        carriers = self.carriers
-        positions = np.round(carriers.positions * np.float32(_position_steps(self.grid))).astype(np.uint16)
-        np.savez_compressed(
-            directory / "carriers.npz",
-            starts=carriers.starts,
-            ids=carriers.ids,
-            positions=positions,
-            deformation=carriers.deformation.astype(np.float16),
-            phi=carriers.phi.astype(np.float16),
-        )
-        jets, turn = table_of(self.motion.falls)
-        np.savez_compressed(directory / "velocity.npz", velocities=self.motion.velocities, jets=jets, turn=turn)
-        np.savez_compressed(directory / "phi.npz", phi=self.phi)
-        heads = {f"heads.{name}": value.numpy() for name, value in self.appearance.decoder.state_dict().items()}
-        glass = {} if self.appearance.glass is None else self.appearance.glass.tables
-        np.savez_compressed(
-            directory / "appearance.npz",
-            features=self.appearance.features.half().numpy(),
-            log_scales=self.appearance.log_scales.half().numpy(),
-            **heads,
-            **{f"{_GLASS}{name}": table.numpy() for name, table in glass.items()},
-        )
+        for name in _FILES:
+            write_npz(directory / f"{name}.npz", self.arrays[name])
 
     @classmethod
     def load(cls, directory: Path) -> Liquid:
@@ -174,59 +176,43 @@ class Liquid:
         path = directory / "liquid.json"
         header = read_json(path)
         try:
-            if header["format"] not in (FORMAT, FORMAT_WITHOUT_GLASS):
-                raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; fit the scene again")
-            with_glass = header["format"] == FORMAT
+            if header["format"] not in (FORMAT, *EARLIER):
+                raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; {_AGAIN}")
             box = header["grid"]
             nx, ny, nz = (int(n) for n in box["shape"])
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
             times = np.array(header["times"], dtype=np.float64)
-            factor, count = _factor(header["factor"]), int(header["carriers"])
-            carried = bool(header["carried"])
+            factor, carried = _factor(header["factor"]), bool(header["carried"])
             # Models of before there was a choice do not say.
             between: BetweenFrames = "forward" if header.get("between_frames") == "forward" else "both"
             composition: Composition = "together" if header.get("composition") == "together" else "over"
             decoder = Decoder(
                 DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})
             )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); fit the scene again") from None
-        ranks = {"starts": 1, "ids": 1, "positions": 2, "deformation": 3, "phi": 1}
-        rows = read_npz(directory / "carriers.npz", ranks)
-        carriers = Carriers(
-            starts=rows["starts"],
-            ids=rows["ids"],
-            positions=rows["positions"].astype(np.float32) / np.float32(_position_steps(grid)),
-            deformation=rows["deformation"].astype(np.float32),
-            phi=rows["phi"].astype(np.float32),
-            count=count,
-        )
-        moves = read_npz(directory / "velocity.npz", {"velocities": 5, "jets": 2, "turn": 2})
-        try:
-            falls = falls_of(moves["jets"], moves["turn"], grid, times)
-        except ValueError as error:
-            raise SplashbenchError(
-                f"{directory / 'velocity.npz'} does not fit liquid.json ({error}); fit the scene again"
-            ) from None
-        motion = Motion(moves["velocities"], factor, falls)
-        phi = read_npz(directory / "phi.npz", {"phi": 4})["phi"]
-        # Models of version 0.1 spell the heads "colour".
-        british = "colour_width" in header["decoder"]
-        heads = {name: f"heads.{name.replace('color', 'colour') if british else name}" for name in decoder.state_dict()}
-        shapes = {heads[name]: value.ndim for name, value in decoder.state_dict().items()}
-        panes = {f"{_GLASS}{name}": rank for name, rank in _GLASS_RANKS.items()} if with_glass else {}
-        tables = read_npz(directory / "appearance.npz", {"features": 2, "log_scales": 2, **shapes, **panes})
-        try:
-            glass = Glass.of_tables({name: tables[f"{_GLASS}{name}"] for name in _GLASS_RANKS}) if with_glass else None
-            decoder.load_state_dict({name: torch.from_numpy(tables[stored]) for name, stored in heads.items()})
-        except (RuntimeError, ValueError):
-            raise SplashbenchError(
-                f"{directory / 'appearance.npz'} does not fit liquid.json; fit the scene again"
-            ) from None
-        appearance = Appearance(
-            torch.from_numpy(tables["features"].astype(np.float32)),
-            torch.from_numpy(tables["log_scales"].astype(np.float32)),
-            decoder,
-            glass,
-        )
-        return cls(times, grid, carriers, motion, phi, appearance, carried, composition, between)
+        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); {_AGAIN}") from None
+        arrays: dict[str, dict[str, np.ndarray]] = {}
+        if header["format"] in EARLIER:
+            track, look = _fitting(directory, lambda: read_earlier(directory, header, grid, times, factor, decoder))
+        else:
+            ranks = {
+                "carriers": {**CARRIERS, **({} if carried else DEFORMATION)},
+                "motion": MOTION,
+                "distance": DISTANCE,
+                "appearance": appearance_ranks(decoder, bool(header.get("glass"))),
+            }
+            arrays = {name: read_npz(directory / f"{name}.npz", ranks[name]) for name in _FILES}
+            track = _fitting(directory, lambda: read_track(arrays, grid, times, factor))
+            look = _fitting(directory / "appearance.npz", lambda: read_appearance(arrays["appearance"], decoder, grid))
+            if len(look.features) != track.carriers.count:
+                others = f"{len(look.features)} carriers, not {track.carriers.count}"
+                raise SplashbenchError(f"{directory / 'appearance.npz'} has {others}; {_AGAIN}")
+        return cls._of_parts(times, track, look, carried, composition, between, arrays)
+
+
+def _fitting(path: Path, read: Callable[[], T]) -> T:
+    """What `read` returns; SplashbenchError where the files at `path` do not fit liquid.json."""
+    try:
+        return read()
+    except (IndexError, KeyError, OverflowError, RuntimeError, ValueError) as error:
+        raise SplashbenchError(f"{path} does not fit liquid.json ({error}); {_AGAIN}") from None

@@ -7,7 +7,7 @@ with what moved the liquid there, `carriers` follow frame by frame, and `appeara
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,11 +21,12 @@ from splashbench.scene.scene import TrainingScene
 
 from .appearance.coarse import HALVINGS, set_smaller_backgrounds, with_smaller
 from .appearance.first_look import photographed, take_on
-from .appearance.fitting import Appearance, fit_appearance, initial_appearance, visible_carriers
+from .appearance.fitting import Appearance, Fit, fit_appearance, initial_appearance, visible_carriers
 from .appearance.glass import glass_before
+from .appearance.iterations import iterations_decision
+from .appearance.sensitivity import Sensitivity
 from .appearance.targets import collect_targets, set_backgrounds
 from .carriers.coverage import uncovered_by_any
-from .carriers.population import Carriers
 from .carriers.subframe import Track
 from .carriers.tracking import CarrierTracker, Simulation, Tracking
 from .carriers.visibility import seen_by_any
@@ -33,11 +34,14 @@ from .fields.container import KnownContainer
 from .fields.observations import Observations, observe
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import FlipSolver, FlipTransport, gravity_in_voxels
-from .model import Liquid, store_precision
+from .model import Liquid
 from .motion.observed_frames import observed_frames
 from .motion.steps import FrameStep, Motion
 from .motion.velocity import control_shape
 from .settings import SplashSplatConfig
+from .storage.signed_distance import reach
+from .storage.steps import storage_step
+from .storage.track import stored_track
 
 Report = Callable[[float, str], None]
 #: The liquid, and what hides it from cameras.
@@ -51,13 +55,11 @@ _GLASS_SIDE = 240
 
 @dataclass(frozen=True)
 class Traced:
-    """The liquid before its appearance: what was observed, carriers through all frames in the precision of the files,
-    what moved them, and the packed phi_t (int8 [T, nx, ny, nz]). config: with what the observations decide."""
+    """The liquid before its appearance: what was observed, and carriers through all frames, what moved them and phi in
+    the precision of the files. config: with what the observations decide."""
 
     observations: Observations
-    carriers: Carriers
-    motion: Motion
-    packed: np.ndarray
+    track: Track
     config: SplashSplatConfig
 
 
@@ -69,8 +71,10 @@ def trace_liquid(
     if observations.in_transparent_container:
         config = config.in_transparent_container()
         run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
-    carriers, motion, packed = _track(observations, scene, config, run, run.progress)
-    return Traced(observations, store_precision(carriers, observations.grid), motion, packed, config)
+    track = _track(observations, scene, config, run, run.progress)
+    with run.stage("carriers"):
+        steps = reach(config.decoder.opacity_slope, config.decoder.opacity_band)
+        return Traced(observations, stored_track(track, scene.times, config.carried, steps), config)
 
 
 def fit_liquid(
@@ -91,37 +95,33 @@ def fit_liquid(
     reconstruction as if the fit ended there, and whether there will be no other for a while. settled: where given,
     `backgrounds` are for the first iterations (`plates_share`), and this gives those for the others.
     """
-    config, observations, carriers = traced.config, traced.observations, traced.carriers
-    motion, packed = traced.motion, traced.packed
+    config, observations, track = traced.config, traced.observations, traced.track
     occlusion = observations.occlusion
     if occlusion is not None and frozen is not None:
         occlusion = occlusion.uncut()  # the background's Gaussians hide what is behind them themselves
-    # What moves the carriers of the other variants is not u_t.
-    carried = config.variant in ("full", "no_resampling")
     composition = config.composition if frozen is not None else "over"
 
-    def reconstruction(appearance: Appearance, left: np.ndarray) -> Reconstruction:
-        kept, look = _pruned(carriers, appearance, left & visible_carriers(appearance, config.prune_opacity))
-        liquid = Liquid.of(
-            scene.times,
-            observations.grid,
-            kept,
-            motion,
-            packed,
-            look,
-            carried,
-            composition,
-            config.between_frames,
-        )
-        return liquid, occlusion
+    def reconstruction(
+        appearance: Appearance, left: np.ndarray, sensitivity: Sensitivity | None = None, step: float | None = None
+    ) -> Reconstruction:
+        kept, look = _pruned(track, appearance, left)
+        made = (scene.times, kept, look, config.carried, composition, config.between_frames)
+        if sensitivity is None or step is None:
+            return Liquid.of(*made), occlusion
+        return Liquid.of(*made, sensitivity.kept(np.flatnonzero(left)), step), occlusion
+
+    def shown(appearance: Appearance, left: np.ndarray) -> np.ndarray:
+        return left & visible_carriers(appearance, config.prune_opacity)
+
+    def as_it_is(appearance: Appearance, left: np.ndarray) -> Reconstruction:
+        return reconstruction(appearance, shown(appearance, left))
 
     def offer_state(state: Callable[[], tuple[Appearance, np.ndarray]], milestone: bool) -> None:
         if offer is not None:
-            offer(lambda: reconstruction(*state()), milestone)
+            offer(lambda: as_it_is(*state()), milestone)
 
     with run.stage("appearance"), one_torch_thread():
-        track = Track(observations.grid, carriers, motion, packed)
-        appearance, left = _fit_appearance(
+        appearance, fit = _fit_appearance(
             track,
             observations,
             occlusion,
@@ -134,13 +134,23 @@ def fit_liquid(
             offer_state,
             settled,
         )
+    if fit is not None and fit.earned:
+        run.decide(iterations_decision(fit.earned, len(fit.losses)))
+    if fit is None:
+        return reconstruction(appearance, np.ones(track.carriers.count, dtype=bool))
+    left = shown(appearance, fit.left)
+    if fit.sensitivity is None:
         return reconstruction(appearance, left)
+    with run.stage("storing"), one_torch_thread():
+        step, decision = storage_step(appearance, left, fit, config.storage_tolerance, run.seed)
+        run.decide(decision)
+        return reconstruction(appearance, left, fit.sensitivity, step)
 
 
 def _track(
     observations: Observations, scene: TrainingScene, config: SplashSplatConfig, run: Run, report: Report
-) -> tuple[Carriers, Motion, np.ndarray]:
-    """Carriers through all frames, what moved them, and the packed phi_t: int8 [T, nx, ny, nz], transport grid."""
+) -> Track:
+    """Carriers through all frames, what moved them, and the packed phi_t."""
     grid, settings = observations.grid, config.motion
     tracker = CarrierTracker(_tracking(observations, scene, config, run.seed))
     steps: list[FrameStep] = []
@@ -150,9 +160,9 @@ def _track(
         if frame.step is not None:
             steps.append(frame.step)
         with run.stage("carriers"):
-            tracker.advance(frame.phi, frame.step)
+            tracker.advance(frame.phi, frame.step, frame.repeated)
     factor = settings.factor(grid.shape)
-    return tracker.carriers(), Motion.of(steps, control_shape(grid.shape, factor), factor), packed
+    return Track(grid, tracker.carriers(), Motion.of(steps, control_shape(grid.shape, factor), factor), packed)
 
 
 def _tracking(observations: Observations, scene: TrainingScene, config: SplashSplatConfig, seed: int) -> Tracking:
@@ -227,9 +237,9 @@ def _fit_appearance(
     progress: Callable[[float], None],
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None],
     settled: Callable[[], dict[str, np.ndarray]] | None,
-) -> tuple[Appearance, np.ndarray]:
-    """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; and which of them
-    were fitted to the end, bool [count]."""
+) -> tuple[Appearance, Fit | None]:
+    """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; None where there
+    are none."""
     voxel = observations.grid.voxel
     appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
     # Gaussians of the background that are drawn together with the liquid's are prepared for one size.
@@ -242,7 +252,7 @@ def _fit_appearance(
         track,
         config.silhouette_norm,
         camera_times=config.camera_times,
-        trusted=~observations.silhouettes.failed_masks,
+        trusted=~(observations.silhouettes.failed_masks | observations.repeated[:, None]),
         hidden=None if occlusion is None else lambda name, points: occlusion.hidden(scene.cameras[name], points),
         cut=None if occlusion is None else lambda name, points: occlusion.cut(scene.cameras[name], points),
         frozen=frozen,
@@ -259,7 +269,7 @@ def _fit_appearance(
         # Edges have so many more pixels along them.
         appearance.glass = glass_before(track, round(config.glass * longest / _GLASS_SIDE), seed)
     if not targets:
-        return appearance, np.ones(track.carriers.count, dtype=bool)
+        return appearance, None
     if config.first_look:
         take_on(photographed(track, targets), appearance.features, appearance.decoder)
     color_cell = observations.hull_grid.voxel / voxel
@@ -272,12 +282,12 @@ def _fit_appearance(
             backgrounds.clear()  # nobody needs those of before, which are large
 
     fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle)
-    return appearance, fit.left
+    return appearance, fit
 
 
-def _pruned(carriers: Carriers, appearance: Appearance, kept: np.ndarray) -> tuple[Carriers, Appearance]:
-    """The carriers `kept` (bool [count]) alone: without phantom volume of the hull, which the images made transparent,
-    and without what they do not show. And the glass that can be seen."""
-    carriers, rows = carriers.keep(kept)
+def _pruned(track: Track, appearance: Appearance, kept: np.ndarray) -> tuple[Track, Appearance]:
+    """The carriers `kept` (bool [count]) alone, and the glass that can be seen."""
+    carriers, rows = track.carriers.keep(kept)
     glass = None if appearance.glass is None else appearance.glass.kept(MIN_ALPHA)
-    return carriers, Appearance(appearance.features[rows], appearance.log_scales[rows], appearance.decoder, glass)
+    look = Appearance(appearance.features[rows], appearance.log_scales[rows], appearance.decoder, glass)
+    return replace(track, carriers=carriers), look

@@ -36,8 +36,11 @@ _DRAFT_PLATES_SHARE = 0.25
 # And the edge of its hull voxels in pixels, and how few there are at least.
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 
+# Share of the iterations, the last ones, in which it is measured what may be stored how coarsely.
+_MEASURED = 0.2
+
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "16"
+VERSION = "17"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -74,6 +77,8 @@ class SplashSplatConfig(MethodConfig):
     replace_empty_masks: bool = True
     #: look for clocks, cameras and exposures that are other than told, in the footage itself, and go by what is found
     self_calibration: bool = True
+    #: model nothing anew in timesteps whose photographs and masks are those of the one before
+    repeats: bool = True
     #: carve, and compare photographs, at each camera's own times, where the scene has them
     camera_times: bool = True
     #: level the liquid that rests in the container (needs the mesh and gravity)
@@ -148,6 +153,9 @@ class SplashSplatConfig(MethodConfig):
     #: share of the photographs by whose loss the fit stops before `iterations`, and which it leaves out; 0 never stops
     validation_share: float = Field(0.0, ge=0, le=0.1)
     stop_gain: float = Field(0.01, ge=0, lt=1)
+    #: PSNR of withheld photographs, in dB, that iterations have to gain for each doubling of the time, so that there
+    #: are more of them; 0 for `stop_gain`
+    price: float = Field(0.0, ge=0, le=10)
     ssim_every: PositiveInt = 1
     #: what the silhouette term is averaged over: the "image", the "window" around all masks of the view, or the "mask"
     silhouette_norm: SilhouetteNorm = "window"
@@ -183,6 +191,9 @@ class SplashSplatConfig(MethodConfig):
     #: share of the iterations, the first ones, that have the footage's clean plates behind the liquid: the background
     #: is fitted afterwards; 0 fits it first. Not where it is drawn "together" with the liquid
     plates_share: float = Field(0.2, ge=0, le=1)
+    #: by how much rounding what is stored may raise the squared error in training photographs, as a share of it; 0
+    #: stores in steps of a twentieth of each value's spread
+    storage_tolerance: float = Field(0.05, ge=0, le=1)
     # Background, fitted by scaffold_gs: its preset
     background_preset: Literal["best", "paper", "brief", "quick"] = "brief"
     #: hull cells, at the most, of a draft that is made first where states of the fit are taken (`run --checkpoints`);
@@ -214,6 +225,7 @@ class SplashSplatConfig(MethodConfig):
             "replace_empty_masks": False,
             "self_calibration": False,
             "camera_times": False,
+            "repeats": False,
             "pool": False,
             "ballistic": False,
             "gate_motion": False,
@@ -314,6 +326,7 @@ class SplashSplatConfig(MethodConfig):
             pool=self.pool,
             ballistic=self.ballistic,
             tight_bounds=self.tight_bounds,
+            repeats=self.repeats,
         )
 
     @property
@@ -387,6 +400,11 @@ class SplashSplatConfig(MethodConfig):
         )
 
     @property
+    def carried(self) -> bool:
+        """Whether the fitted velocity is what moves the carriers; what moves those of the other variants is not u_t."""
+        return self.variant in ("full", "no_resampling")
+
+    @property
     def decoder(self) -> DecoderSettings:
         return DecoderSettings(
             feature_size=self.feature_size,
@@ -411,6 +429,7 @@ class SplashSplatConfig(MethodConfig):
             anneal=self.anneal,
             validation_share=self.validation_share,
             stop_gain=self.stop_gain,
+            price=self.price,
             ssim_every=self.ssim_every,
             base_scale=self.base_scale,
             prune_opacity=self.prune_opacity,
@@ -418,6 +437,7 @@ class SplashSplatConfig(MethodConfig):
             coarse_share=self.coarse_share,
             coarsest_share=self.coarsest_share,
             plates_share=self.plates_share,
+            measured_share=_MEASURED if self.storage_tolerance > 0 else 0,
             weights=LossWeights(
                 foreground=self.foreground_weight,
                 gradient=self.gradient_weight,

@@ -6,19 +6,20 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splashbench.cli.arguments import add_method, add_run_options, add_scene, add_settings
+from splashbench.cli.arguments import add_method, add_run_options, add_scene, add_settings, positive_number
 from splashbench.cli.command import RENAMED, add_command
 from splashbench.cli.output import emit, say
 
 if TYPE_CHECKING:
     from splashbench.scene import Scene, SignedDistance
-    from splashbench.submission import Submission
+    from splashbench.submission import Budget, Submission
 
 _EPILOG = """\
 examples:
   splashbench run splashsplat scenes/bowl_001 submissions/bowl_001/splashsplat
   splashbench run splashsplat SCENE OUT --preset quick --seed 1 --set iterations=500
   splashbench run splashsplat SCENE OUT --checkpoints   with its quality over time, for `score` and `leaderboard`
+  splashbench run splashsplat SCENE OUT --budget-seconds 60 --budget-mb 2
   splashbench run nothing SCENE OUT                 the frozen background alone, the reference for dPSNR
   splashbench run oracle SCENE OUT                  the ground truth itself, a check of the scoring
   splashbench run my_method.py:MyMethod SCENE OUT   a method that is not installed (CONTRIBUTING.md)
@@ -57,7 +58,34 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         action="store_true",
         help="also keep the views of the fit on its way, after about 5, 7, 10, 14, 20 ... seconds of it",
     )
+    _add_budgets(parser)
     add_run_options(parser)
+
+
+def _add_budgets(parser: argparse.ArgumentParser) -> None:
+    budgets = parser.add_argument_group("what the fit may cost (`splashbench explain OUT` tells what it was spent on)")
+    for name, unit, what in (
+        ("seconds", "seconds", "of the fit"),
+        ("mb", "megabytes", "of the stored model"),
+        ("memory", "megabytes", "of memory, at the most"),
+    ):
+        budgets.add_argument(
+            f"--budget-{name}", type=positive_number(unit, 1e9), metavar=unit.upper(), help=f"{unit} {what}"
+        )
+
+
+def _budget(arguments: argparse.Namespace) -> Budget | None:
+    from splashbench.submission import Budget
+
+    def whole(megabytes: float | None) -> int | None:
+        return None if megabytes is None else max(round(megabytes * 1e6), 1)
+
+    budget = Budget(
+        seconds=arguments.budget_seconds,
+        storage_bytes=whole(arguments.budget_mb),
+        memory_bytes=whole(arguments.budget_memory),
+    )
+    return budget if budget.limits else None
 
 
 def _which_timesteps(text: str) -> str:
@@ -91,6 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
         exr=arguments.exr,
         withheld=arguments.withhold,
         checkpoints=MARKS if arguments.checkpoints else None,
+        budget=_budget(arguments),
         keep_model=not arguments.no_model,
         replace=arguments.replace,
         oracle_geometry=_oracle_geometry,

@@ -4,7 +4,7 @@ Every output is written beside its place and renamed onto it. Every input that m
 limits on its size, without pickles, and fails with one line that names the file.
 """
 
-from splashbench.files.arrays import MAX_NPZ_BYTES, read_npz
+from splashbench.files.arrays import MAX_NPZ_BYTES, compressed_bytes, read_npz, write_npz
 from splashbench.files.atomic import (
     as_asked,
     atomic_directory,
@@ -43,6 +43,7 @@ __all__ = [
     "as_asked",
     "atomic_directory",
     "atomic_path",
+    "compressed_bytes",
     "files_together",
     "image_size",
     "is_staged_for",
@@ -64,6 +65,7 @@ __all__ = [
     "write_image",
     "write_json",
     "write_model",
+    "write_npz",
     "write_png",
     "write_text",
 ]

@@ -23,7 +23,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from splashbench.errors import SplashbenchError
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+from splashbench.submission.budget import Budget
 from splashbench.submission.decisions import MAX_DECISIONS, Decision
+from splashbench.submission.decisions import MAX_RUNGS as MAX_RUNGS
+from splashbench.submission.decisions import Rung as Rung
 from splashbench.submission.identity import MAX_NOTE, MAX_NOTES
 
 T = TypeVar("T")
@@ -60,6 +63,7 @@ class Run:
         device: "cpu", or a device the method's framework knows, such as "cuda".
         directory: scratch space, removed after the run.
         budget_seconds: the time after which the harness stops the fit, or None. A method may use less.
+        budget: what the fit may cost, as far as the method takes budgets (`Method.budgets`).
         cache: a folder for parts that runs of one study share, see `reuse`; None in ordinary runs.
         reused: parts that came from there, and the seconds their fit took in an earlier run.
         stages: seconds of the fit's stages, see `stage`.
@@ -71,6 +75,7 @@ class Run:
     device: str = "cpu"
     directory: Path = Path()
     budget_seconds: float | None = None
+    budget: Budget = field(default_factory=Budget)
     cache: Path | None = None
     reused: dict[str, float] = field(default_factory=dict)
     stages: dict[str, float] = field(default_factory=dict)
@@ -80,6 +85,7 @@ class Run:
     _inner_seconds: float = 0.0
     _told: float = 0.0
     _digests: dict[Path, str] = field(default_factory=dict)
+    _started: float = field(default_factory=time.perf_counter)
     _report: Callable[[float, str], None] | None = None
     _checkpoints: Checkpoints | None = None
 
@@ -210,6 +216,11 @@ class Run:
             self.reused[name] = part.loaded_seconds
         return part.value
 
+    @property
+    def seconds(self) -> float:
+        """Of the fit so far, as record.json will count them."""
+        return self.fit_seconds(time.perf_counter() - self._started)
+
     def fit_seconds(self, wall_seconds: float) -> float:
         """What a fit of `wall_seconds` would have taken by itself: with the fits of what it reused."""
         spent = self._overhead_seconds + self._checkpoint_seconds()
@@ -285,6 +296,8 @@ class Method(ABC):
     Config: ClassVar[type[MethodConfig]] = MethodConfig
     #: What `Run.device` may be; a GPU method lists "cuda" too.
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
+    #: Which limits of `Budget` the method keeps to; with others the user is told that it does not.
+    budgets: ClassVar[tuple[str, ...]] = ()
     #: True for the yardsticks that are no reconstructions (methods/controls).
     control: ClassVar[bool] = False
     #: True where one set of primitives holds background and liquid, see docs/protocol.md, "mixed methods".

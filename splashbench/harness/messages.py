@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from splashbench.submission import Decision, Status
+from splashbench.submission import Budget, Decision, Status
 
 
 class Request(BaseModel):
@@ -41,6 +41,7 @@ class Request(BaseModel):
     only_views: bool = False
     checkpoints: str | None = None
     marks: list[float] = []
+    budget: Budget = Budget()
     importer: str | None = None
     source: str = ""
     export: str = ""

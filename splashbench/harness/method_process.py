@@ -82,6 +82,7 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
             device=request.device,
             directory=Path(request.scratch),
             budget_seconds=request.budget_seconds,
+            budget=request.budget,
             cache=Path(request.cache) if request.cache else None,
             _report=_reporter(stream),
         )

@@ -23,7 +23,17 @@ from splashbench.harness.messages import Outcome, Request
 from splashbench.harness.training_copy import make_training_copy
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene, SignedDistance
-from splashbench.submission import IDENTITY, Checkpoint, Identity, Record, Status, Submission, identity_text, seal
+from splashbench.submission import (
+    IDENTITY,
+    Budget,
+    Checkpoint,
+    Identity,
+    Record,
+    Status,
+    Submission,
+    identity_text,
+    seal,
+)
 from splashbench.submission.withheld import Withheld, kept_timesteps, scored_timesteps
 from splashbench.version import __version__
 
@@ -48,6 +58,7 @@ def run_method(
     cache: Path | None = None,
     withheld: Withheld | None = None,
     checkpoints: Sequence[float] | None = None,
+    budget: Budget | None = None,
     oracle_geometry: Callable[[Scene], SignedDistance | None] | None = None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
@@ -63,6 +74,7 @@ def run_method(
         withheld: timesteps that the method does not see; they are rendered and scored (submission/withheld.py).
         checkpoints: seconds of the fit after which its state is taken, and the test views rendered by it, such as
             `checkpoints.MARKS`.
+        budget: what the fit may cost; only limits that the method keeps to (`Method.budgets`).
         oracle_geometry: for the control `oracle` alone, see `write_oracle`.
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
@@ -79,7 +91,7 @@ def run_method(
             "`external` is run by commands: splashbench run-external SCENE OUT --name ... --command ..."
         )
     if name == ORACLE:
-        if preset or overrides or withheld or checkpoints:
+        if preset or overrides or withheld or checkpoints or budget:
             raise SplashbenchError("the oracle is the truth itself: it has no presets, settings or fit; leave them out")
         from splashbench.harness.oracle import write_oracle
 
@@ -88,6 +100,7 @@ def run_method(
     if device not in method.devices:
         devices = ", ".join(method.devices)
         raise SplashbenchError(f"method {method.id} runs on {devices}, not on {device!r}; leave --device out")
+    _require_budgets(method, budget)
     preset = preset or next(iter(method.Config.presets))
     config = method.Config.preset(preset, overrides)
     identity = _identity(
@@ -95,6 +108,7 @@ def run_method(
         preset=preset,
         settings=without_nulls(config.model_dump(mode="json")),
         overrides=override_texts(overrides or {}),
+        budget=budget,
         seed=seed,
         device=device,
         scene=scene.name,
@@ -128,12 +142,24 @@ def run_method(
                 times={name: scene.camera_times[name].tolist() for name in scene.test} if withheld else None,
                 checkpoints=str(_folder(Path(scratch, "checkpoints"))) if checkpoints else None,
                 marks=list(checkpoints or ()),
+                budget=budget or Budget(),
             ),
         )
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, method.id)
         seal(staging, identity, record)
     return Submission.open(out)
+
+
+def _require_budgets(method: Method, budget: Budget | None) -> None:
+    """Raise SplashbenchError for a limit that the method does not keep to."""
+    for name in budget.limits if budget else ():
+        if name not in method.budgets:
+            kept = ", ".join(sorted(limit.removesuffix("_bytes") for limit in method.budgets)) or "none"
+            raise SplashbenchError(
+                f"method {method.id} keeps to no budget of {name.removesuffix('_bytes')} (to those of: {kept}); "
+                "leave it out, or give settings that make it smaller"
+            )
 
 
 def _identity(method: Method, **run: Any) -> Identity:

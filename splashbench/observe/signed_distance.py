@@ -6,7 +6,7 @@ default; "carve" is the paper's: binary carving, then a 3-D distance transform. 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -77,13 +77,15 @@ def signed_distance_frames(
     grid: Grid,
     method: SignedDistanceMethod = "silhouette",
     container: ContainerOcclusion | None = None,
+    frames: Iterable[int] | None = None,
 ) -> Iterator[np.ndarray]:
     """phi of one frame after another on `grid`, float32 [nx, ny, nz] in voxels: no more than one frame in memory.
 
     container: where given, no liquid is in its walls, and what it hides from a view is not held against the liquid.
+    frames: which ones; all by default.
     """
     carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
-    for t in range(silhouettes.n_frames):
+    for t in range(silhouettes.n_frames) if frames is None else frames:
         phi = carve_frame(silhouettes, grid, t, carving)
         yield phi if method == "silhouette" else signed_distance_of(phi < 0)
 

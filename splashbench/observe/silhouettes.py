@@ -184,6 +184,11 @@ class Silhouettes:
         self.failed_masks |= masks & enough[:, None]
 
     @property
+    def between_frames(self) -> bool:
+        """Whether some view is carved with between its own frames."""
+        return any(share != 0 or first != t for view in self._between for t, (first, _, share) in enumerate(view))
+
+    @property
     def nbytes(self) -> int:
         """Bytes that the masks take."""
         return sum(bits.nbytes for packed in self._packed for bits in packed)

@@ -1,5 +1,6 @@
 """Submissions: what a method hands in. Writing, reading and checking them."""
 
+from splashbench.submission.budget import Budget
 from splashbench.submission.decisions import Decision, Rung
 from splashbench.submission.identity import (
     PROTOCOL,
@@ -24,6 +25,7 @@ __all__ = [
     "IDENTITY",
     "PROTOCOL",
     "RENAMED_FIGURES",
+    "Budget",
     "Checkpoint",
     "Decision",
     "Identity",

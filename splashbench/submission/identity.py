@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from splashbench.submission.budget import Budget
 from splashbench.submission.decisions import MAX_DECISIONS, Decision
 from splashbench.submission.withheld import Withheld
 
@@ -55,6 +56,8 @@ class Identity(BaseModel):
     settings: dict[str, Any] = Field(default_factory=dict)
     #: KEY=VALUE: settings that were given on top of the preset
     overrides: list[Annotated[str, Field(max_length=100_000)]] = Field(default_factory=list, max_length=1000)
+    #: What the user said that the fit may cost, where anything was said.
+    budget: Budget | None = None
     seed: int = 0
     device: str = "cpu"
     scene: str

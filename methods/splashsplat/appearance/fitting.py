@@ -29,7 +29,8 @@ from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_
 from .glass import Glass, GlassFit, Splats
 from .optimizer import RowAdam
 from .photographs import ReadAhead, read_now
-from .schedule import AdaptiveSchedule, FixedSchedule, Schedule, withheld
+from .schedule import AdaptiveSchedule, Earned, EarningSchedule, FixedSchedule, Schedule, WithheldLook, withheld
+from .sensitivity import Sensitivities, Sensitivity
 from .shared_features import SharedFeatures
 from .targets import TrainingTarget
 
@@ -38,6 +39,8 @@ Composition = Literal["over", "together"]
 
 # Iterations between two looks at the withheld photographs.
 _LOOK_EVERY = 100
+# Iterations that would take as long as all that comes before them does on most scenes.
+_BEFORE = 1500
 # Iterations in which the learning rates fall, as a share of those before.
 _FALL = 0.5
 # When transparent carriers are left out, as shares of the iterations: not in the last fifth, which makes up for them.
@@ -60,16 +63,19 @@ class FitSettings:
     iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
     anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. validation_share: of the
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
-    `AdaptiveSchedule`. prune_opacity: carriers whose learned opacity is below this at one of `_PRUNINGS` are not
-    fitted any further; 0 fits all to the end. feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is
-    that of the shared parts. coarse_share: of the iterations, the first ones, that see targets at half
-    their size where these have one; coarsest_share: of all, the first ones, that see them at a quarter.
-    plates_share: of the iterations, the first ones, for which the background is not needed yet.
+    `AdaptiveSchedule`. price: see `EarningSchedule`, which is taken where it is above 0. prune_opacity: carriers whose
+    learned opacity is below this at one of `_PRUNINGS` are not fitted any further; 0 fits all to the end.
+    feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is that of the shared parts. coarse_share: of
+    the iterations, the first ones, that see targets at half their size where these have one; coarsest_share: of all,
+    the first ones, that see them at a quarter. plates_share: of the iterations, the first ones, for which the
+    background is not needed yet. measured_share: of the iterations, the last ones, in which it is measured how much
+    photographs change with what is learned.
     """
 
     iterations: int = 1000
     validation_share: float = 0.0
     stop_gain: float = 0.01
+    price: float = 0.0
     learning_rate_features: float = 0.06
     learning_rate_cells: float = 0.02
     feature_cells: tuple[float, ...] = ()
@@ -84,6 +90,7 @@ class FitSettings:
     coarse_share: float = 0.0
     coarsest_share: float = 0.0
     plates_share: float = 0.0
+    measured_share: float = 0.0
     weights: losses.LossWeights = field(default_factory=losses.LossWeights)
 
 
@@ -100,10 +107,17 @@ class Appearance:
 
 @dataclass(frozen=True)
 class Fit:
-    """losses: of every iteration. left: bool [count], the carriers that were fitted to the end."""
+    """losses: of every iteration. left: bool [count], the carriers that were fitted to the end. sensitivity: of the
+    photographs to what was learned; None where it was not asked for. drawn: given the number of a target, features and
+    log-scales of all carriers, the window as these would show it, and its photograph. photographs: how many targets.
+    earned: what stretches of iterations bought, where that decided how many there were."""
 
     losses: list[float]
     left: np.ndarray
+    sensitivity: Sensitivity | None
+    drawn: Callable[[int, Tensor, Tensor], tuple[Tensor, WindowPhotograph]]
+    photographs: int
+    earned: tuple[Earned, ...] = ()
 
 
 def initial_appearance(
@@ -218,6 +232,13 @@ def image_loss(
     return loss
 
 
+def masked_psnr(image: Tensor, photograph: WindowPhotograph) -> float:
+    """PSNR of a window within the photograph's mask, dB."""
+    inside = image[photograph.box][photograph.mask].clamp(0, 1)
+    error = (inside - photograph.image[photograph.mask].to(torch.float32) / 255).square().mean()
+    return -10 * math.log10(max(float(error), 1e-10)) if len(inside) else 0.0
+
+
 def penalty_loss(penalties: Penalties, voxel: float, weights: losses.LossWeights) -> Tensor:
     """The weighted sum of the other terms."""
     return (
@@ -265,10 +286,17 @@ def fit_appearance(
         seed,
     )
     rng = np.random.default_rng([seed, 1])
+    measured: Sensitivities | None = None
+    if settings.measured_share > 0:
+        measured = Sensitivities(track.carriers.count, appearance.features.shape[1] + appearance.log_scales.shape[1])
     withheld_targets = np.zeros(len(targets), dtype=bool)
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
     if settings.validation_share > 0:
-        adaptive = AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+        adaptive: AdaptiveSchedule | EarningSchedule = (
+            EarningSchedule(settings.iterations, _LOOK_EVERY, settings.price, _BEFORE, _FALL)
+            if settings.price > 0
+            else AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+        )
         if adaptive.may_stop:
             withheld_targets = withheld(len(targets), settings.validation_share, np.random.default_rng([seed, 3]))
         if withheld_targets.any() or not adaptive.may_stop:
@@ -298,14 +326,16 @@ def fit_appearance(
         return [features.of_frame(t, active.places), appearance.log_scales.index_select(0, active.ids)]
 
     @torch.no_grad()
-    def loss_of_withheld() -> float:
-        weights, total = settings.weights, 0.0
+    def withheld_look() -> WithheldLook:
+        weights, total, quality = settings.weights, 0.0, []
         for number in np.nonzero(withheld_targets)[0]:
-            target = targets[number]
+            target = targets[number].coarse or targets[number]  # of one size at all looks
             active = carriers.of(target)
             image, alpha, _ = seen(target, active, learned(target.frame, active), penalised=False)
-            total += float(image_loss(image, alpha, read_now(target.photograph), target.area, weights, weights.ssim))
-        return total / int(withheld_targets.sum())
+            photograph = read_now(target.photograph)
+            total += float(image_loss(image, alpha, photograph, target.area, weights, weights.ssim))
+            quality.append(masked_psnr(image, photograph))
+        return WithheldLook(total / int(withheld_targets.sum()), np.array(quality))
 
     @torch.no_grad()
     def idle(target: TrainingTarget, active: Active) -> Tensor:
@@ -324,6 +354,13 @@ def fit_appearance(
         look = Appearance(features.all(), appearance.log_scales, decoder, appearance.glass)
         return look, carriers.left(track.carriers.count)
 
+    @torch.no_grad()
+    def drawn(number: int, every_feature: Tensor, every_scale: Tensor) -> tuple[Tensor, WindowPhotograph]:
+        target = targets[number]
+        active = carriers.of(target)
+        children, _ = decoder.decode(every_feature, every_scale, active.ids, active.state, target.eye)
+        return shown(children, replace(target, modes=None), active)[0], read_now(target.photograph)
+
     def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
         """`target` in the size that it has at `iteration`."""
         done = schedule.done(iteration)
@@ -341,7 +378,7 @@ def fit_appearance(
     iteration = 0
     while True:
         if schedule.due(iteration):
-            schedule.look(iteration, loss_of_withheld())
+            schedule.look(iteration, withheld_look())
         factor = schedule.factor(iteration)
         if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
             if offer is not None and iteration >= shown_from:
@@ -384,6 +421,8 @@ def fit_appearance(
         by_feature, by_scale, *others = torch.autograd.grad(loss, [*values, *parameters, *panes])
         for parameter, gradient in zip(parameters, others):
             parameter.grad = gradient
+        if measured is not None and schedule.done(iteration) >= 1 - settings.measured_share:
+            measured.add(active.ids, torch.cat([by_feature, by_scale], dim=1))
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
@@ -401,7 +440,14 @@ def fit_appearance(
     if glass is not None:
         glass.done()
     appearance.features = features.all()
-    return Fit(history, carriers.left(track.carriers.count))
+    return Fit(
+        history,
+        carriers.left(track.carriers.count),
+        None if measured is None else measured.found(),
+        drawn,
+        len(targets),
+        tuple(schedule.earned) if isinstance(schedule, EarningSchedule) else (),
+    )
 
 
 @torch.no_grad()

@@ -2,7 +2,8 @@
 
 A fixed schedule runs all its iterations, at full rates (the paper) or down a half cosine. An adaptive one keeps the
 rates up while photographs that it withholds from the fit still get better explained, and brings them down once they do
-not: a scene gets as many iterations as it can use.
+not: a scene gets as many iterations as it can use. An earning one does so once they get better by less than the time is
+worth that it takes.
 """
 
 from __future__ import annotations
@@ -24,6 +25,14 @@ def _cosine(done: float) -> float:
     return LOWEST + (1 - LOWEST) * 0.5 * (1 + math.cos(math.pi * done))
 
 
+@dataclass(frozen=True)
+class WithheldLook:
+    """How withheld photographs are explained. loss: their mean. psnr: of each, within its mask, dB: float64 [n]."""
+
+    loss: float
+    psnr: np.ndarray
+
+
 class Schedule(Protocol):
     """What the fit asks before every iteration, counted from 0."""
 
@@ -34,8 +43,8 @@ class Schedule(Protocol):
     def due(self, iteration: int) -> bool:
         """Whether the withheld photographs are to be looked at before this iteration."""
 
-    def look(self, iteration: int, loss: float) -> None:
-        """Take note of the withheld photographs' mean loss before this iteration."""
+    def look(self, iteration: int, seen: WithheldLook) -> None:
+        """Take note of how the withheld photographs were explained before this iteration."""
 
     def factor(self, iteration: int) -> float | None:
         """By how much the learning rates are multiplied; None where the fit is over."""
@@ -58,7 +67,7 @@ class FixedSchedule:
     def due(self, iteration: int) -> bool:
         return False
 
-    def look(self, iteration: int, loss: float) -> None:
+    def look(self, iteration: int, seen: WithheldLook) -> None:
         raise AssertionError("a fixed schedule looks at nothing")
 
     def factor(self, iteration: int) -> float | None:
@@ -68,6 +77,76 @@ class FixedSchedule:
 
     def done(self, iteration: int) -> float:
         return iteration / self.iterations
+
+
+@dataclass(frozen=True)
+class Earned:
+    """What a stretch of iterations bought. iterations: from, to. gain: of the withheld photographs' PSNR, dB, with its
+    standard error over photographs. price: what it had to be. quality: PSNR at its end, dB."""
+
+    iterations: tuple[int, int]
+    quality: float
+    gain: float
+    standard_error: float
+    price: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether the stretch was worth its time."""
+        return self.gain > self.price
+
+
+class EarningSchedule:
+    """Full rates as long as withheld photographs gain what the time is worth, then a half cosine over half as many.
+
+    price: dB for each doubling of the time. before: iterations that would take as long as all that comes before the
+    first. limit: iterations at most, both parts together. every: iterations between two looks at the withheld
+    photographs; `_LOOKS` of them are averaged, and compared with as many before. Time is counted in iterations, so that
+    the same fit ends at the same iteration on any machine.
+    """
+
+    def __init__(self, limit: int, every: int, price: float, before: int, fall: float) -> None:
+        self.limit, self.every, self.price, self.before, self.fall = limit, every, price, before, fall
+        self.earned: list[Earned] = []
+        self._looks: list[np.ndarray] = []
+        self._turn = round(limit / (1 + fall))
+        self._turned = False
+        #: whether looks can end the first part before the limit does
+        self.may_stop = 2 * _LOOKS * every < self._turn
+
+    @property
+    def withholds(self) -> bool:
+        return self.may_stop and not self._turned
+
+    def due(self, iteration: int) -> bool:
+        return self.withholds and iteration > 0 and iteration % self.every == 0
+
+    def look(self, iteration: int, seen: WithheldLook) -> None:
+        self._looks.append(seen.psnr)
+        if len(self._looks) < 2 * _LOOKS:
+            return
+        before, now = (np.mean(part, axis=0) for part in (self._looks[-2 * _LOOKS : -_LOOKS], self._looks[-_LOOKS:]))
+        gains = now - before
+        stretch = _LOOKS * self.every
+        price = self.price * math.log2((iteration + self.before) / (iteration - stretch + self.before))
+        error = float(gains.std(ddof=1) / math.sqrt(len(gains))) if len(gains) > 1 else 0.0
+        found = Earned((iteration - stretch, iteration), float(now.mean()), float(gains.mean()), error, price)
+        self.earned.append(found)
+        if not found.pays:
+            self._turn = min(self._turn, iteration)
+
+    def factor(self, iteration: int) -> float | None:
+        if iteration >= self._end:
+            return None
+        self._turned = iteration >= self._turn
+        return _cosine((iteration - self._turn) / (self._end - self._turn)) if self._turned else 1.0
+
+    def done(self, iteration: int) -> float:
+        return iteration / self._end
+
+    @property
+    def _end(self) -> int:
+        return min(self.limit, max(self._turn + 1, round((1 + self.fall) * self._turn)))
 
 
 class AdaptiveSchedule:
@@ -95,8 +174,8 @@ class AdaptiveSchedule:
     def due(self, iteration: int) -> bool:
         return self.withholds and iteration > 0 and iteration % self.every == 0
 
-    def look(self, iteration: int, loss: float) -> None:
-        self.losses.append(loss)
+    def look(self, iteration: int, seen: WithheldLook) -> None:
+        self.losses.append(seen.loss)
         # At full rates a look is off by some per cent either way: single ones ended fits that still gained.
         before, now = self.losses[-2 * _LOOKS : -_LOOKS], self.losses[-_LOOKS:]
         if len(before) == _LOOKS and sum(now) > (1 - self.gain) * sum(before):

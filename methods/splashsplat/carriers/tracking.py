@@ -92,12 +92,17 @@ class CarrierTracker:
         self._simulation: Simulation | None = None
         self._frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def advance(self, phi: np.ndarray, step: FrameStep | None) -> None:
+    def advance(self, phi: np.ndarray, step: FrameStep | None, repeated: bool = False) -> None:
         """To the next frame.
 
         phi: phi_t on the hull grid, transport voxels. step: the motion since the frame before; None in the first frame.
+        repeated: whether the frame shows nothing new, so that carriers stay as they are and do not age.
         """
         t = len(self._frames)
+        if repeated and self._settings.variant != "per_frame" and self._simulation is None:
+            self._last_frames[self._ids] += 1
+            self._frames.append(self._frames[-1])
+            return
         if self._settings.variant == "per_frame":
             self._keep(slice(0))
         elif step is not None and self._simulation is not None:

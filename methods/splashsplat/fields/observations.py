@@ -28,12 +28,13 @@ from splashbench.scene.scene import TrainingScene
 from .container import KnownContainer, known_container
 from .gravity_cues import GravityCues, gravity_cues
 from .occlusion import LiquidOcclusion
+from .repeats import repeated_frames
 from .rim import rim_of
 
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 9
+_REVISION = 10
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class FieldSettings:
     pool: bool
     ballistic: bool
     tight_bounds: bool = True
+    repeats: bool = True
 
     def key(self) -> dict[str, Any]:
         """What a stored phi_t was computed with; it is on the hull grid, whatever the transport grid."""
@@ -71,7 +73,7 @@ class Observations:
     silhouettes: the masks; those that failed are distrusted. hull_grid, grid: the fine grid of phi_t, and the coarser
     one of transport, with one origin. container: what carving knows of it, or None. occlusion: what it hides from
     cameras, or None. container_depths: per view its depth image, None where it hides nothing. cues: jet and pool, or
-    None where gravity is not known.
+    None where gravity is not known. repeated: bool [T], frames that show nothing new.
     """
 
     settings: FieldSettings
@@ -82,6 +84,7 @@ class Observations:
     occlusion: LiquidOcclusion | None
     container_depths: list[np.ndarray | None]
     cues: GravityCues | None
+    repeated: np.ndarray
 
     @property
     def n_frames(self) -> int:
@@ -103,13 +106,21 @@ class Observations:
         Half precision is a thousandth of a voxel near the surface. Every run has it, so that what is stored for other
         runs takes half the room and is what they would compute.
         """
-        frames = signed_distance_frames(self.silhouettes, self.hull_grid, self.settings.signed_distance, self.container)
+        frames = signed_distance_frames(
+            self.silhouettes,
+            self.hull_grid,
+            self.settings.signed_distance,
+            self.container,
+            np.flatnonzero(~self.repeated).tolist(),
+        )
+        phi: np.ndarray | None = None
         for t in range(self.n_frames):
-            with run.stage("signed distance"):
-                phi = next(frames)
-                if self.cues is not None:
-                    phi = self.cues.refined(phi, self.hull_grid, t)
-                phi = torch.from_numpy(phi).half().numpy()  # twice as fast as numpy's, and the same
+            if phi is None or not self.repeated[t]:
+                with run.stage("signed distance"):
+                    phi = next(frames)
+                    if self.cues is not None:
+                        phi = self.cues.refined(phi, self.hull_grid, t)
+                    phi = torch.from_numpy(phi).half().numpy()  # twice as fast as numpy's, and the same
             yield phi
 
     def in_transport_voxels(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -190,7 +201,12 @@ def observe(
                 find_pool=settings.pool,
                 find_jets=settings.ballistic,
             )
-    return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues)
+    repeated = repeated_frames(scene, silhouettes) if settings.repeats else np.zeros(scene.n_frames, dtype=bool)
+    if repeated.any():
+        run.note(
+            "repeated frames", f"{int(repeated.sum())} of {len(repeated)} timesteps show what the one before shows"
+        )
+    return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues, repeated)
 
 
 def _cells(bounds: Bounds, scene: TrainingScene, settings: FieldSettings, voxel_pixels: float) -> tuple[int, int]:

@@ -50,12 +50,14 @@ class ObservedFrame:
     """One frame.
 
     phi: phi_t on the hull grid, float32 in transport voxels. packed: int8 on the transport grid, see
-    `pack_signed_distance`. step: what moved the liquid since the frame before; None in the first.
+    `pack_signed_distance`. step: what moved the liquid since the frame before; None in the first. repeated: whether it
+    shows nothing new.
     """
 
     phi: np.ndarray
     packed: np.ndarray
     step: FrameStep | None
+    repeated: bool = False
 
 
 def observed_frames(
@@ -98,10 +100,13 @@ def _frames(
             phi, now = observations.in_transport_voxels(stored)
             packed = pack_signed_distance(now)
         step = None
-        if before is not None:
+        repeated = bool(observations.repeated[t])
+        if before is not None and repeated:
+            step = FrameStep(fit.still, fit.factor)
+        elif before is not None:
             step = FrameStep(control(t - 1, before, now), fit.factor, fit.fall(t - 1))
         before = now
-        yield ObservedFrame(phi, packed, step)
+        yield ObservedFrame(phi, packed, step, repeated)
         report(progress + (1 - progress) * (t + 1) / observations.n_frames, what)
 
 
@@ -148,7 +153,7 @@ def _shared_controls(
         before: np.ndarray | None = None
         for t, phi in enumerate(distances):
             _, now = observations.in_transport_voxels(phi)
-            if before is not None:
+            if before is not None and not observations.repeated[t]:
                 controls[t - 1] = fit.control(t - 1, before, now)
             before = now
             done = (t + 1) / distances.n_frames

@@ -30,7 +30,7 @@ def taught(balls: Scene) -> tuple[Track, list[TrainingTarget]]:
     training = balls.training()
     grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
     traced = trace_liquid(training, SplashSplatConfig.preset("quick", TINY), Run(seed=1))
-    track = Track(traced.observations.grid, traced.carriers, traced.motion, traced.packed)
+    track = traced.track
     return track, collect_targets(training, grey, track, "window")
 
 

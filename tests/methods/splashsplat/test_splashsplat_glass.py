@@ -158,7 +158,7 @@ def test_only_liquid_in_a_transparent_container_has_glass_and_files_keep_it(in_g
     assert glass is not None
     assert len(glass) > 0
     liquid.save(tmp_path)
-    assert read_json(tmp_path / "liquid.json")["format"] == 4
+    assert read_json(tmp_path / "liquid.json")["glass"] is True
     loaded = Liquid.load(tmp_path).appearance.glass
     assert loaded is not None
     for name, table in glass.tables.items():
@@ -168,7 +168,7 @@ def test_only_liquid_in_a_transparent_container_has_glass_and_files_keep_it(in_g
     opaque = fitted(in_glass)
     assert opaque.appearance.glass is None
     opaque.save(tmp_path)
-    assert read_json(tmp_path / "liquid.json")["format"] == 3
+    assert read_json(tmp_path / "liquid.json")["glass"] is False
     assert Liquid.load(tmp_path).appearance.glass is None
 
 

@@ -197,21 +197,6 @@ def test_a_saved_container_that_is_broken_is_named(tmp_path: Path):
         LiquidOcclusion.load(tmp_path)
 
 
-def test_a_model_of_version_0_1_is_read_though_it_spells_colour(balls_copy: Path, tmp_path: Path):
-    cut(balls_copy, 1)
-    fitted = fit(balls_copy)
-    fitted.liquid.save(tmp_path)
-    header = json.loads((tmp_path / "liquid.json").read_text())
-    header["decoder"]["colour_width"] = header["decoder"].pop("color_width")
-    (tmp_path / "liquid.json").write_text(json.dumps(header))
-    with np.load(tmp_path / "appearance.npz") as tables:
-        british = {name.replace("color", "colour"): tables[name] for name in tables.files}
-    assert "heads.colour_out.bias" in british
-    np.savez_compressed(tmp_path / "appearance.npz", **british)
-    loaded, camera = as_fitted(Liquid.load(tmp_path), None), Scene.open(balls_copy).cameras["6"]
-    np.testing.assert_array_equal(loaded.render(camera, 0.0).rgb, fitted.render(camera, 0.0).rgb)
-
-
 def test_a_model_whose_header_is_broken_is_named(tmp_path: Path):
     grid = {"shape": [2, 2, 2], "origin": [0, 0, 0], "voxel": 1.0}
     header = {"format": 3, "grid": grid, "times": [0.0], "factor": 4, "carriers": 0, "carried": True, "decoder": []}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -9,11 +11,14 @@ from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench.synth.balls import write_balls_scene
 from splashbench_methods.splashsplat.appearance import fitting as fit
+from splashbench_methods.splashsplat.appearance.iterations import iterations_decision
 from splashbench_methods.splashsplat.appearance.schedule import (
     LOWEST,
     AdaptiveSchedule,
+    EarningSchedule,
     FixedSchedule,
     Schedule,
+    WithheldLook,
     withheld,
 )
 from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
@@ -28,7 +33,7 @@ def factors(schedule: Schedule, losses: dict[int, float] | None = None) -> list[
     while True:
         if schedule.due(len(found)):
             assert losses is not None
-            schedule.look(len(found), losses[len(found)])
+            schedule.look(len(found), WithheldLook(losses[len(found)], np.zeros(1)))
         factor = schedule.factor(len(found))
         if factor is None:
             return found
@@ -148,3 +153,45 @@ def test_withheld_photographs_are_fitted_once_the_rates_fall(many_balls: Scene, 
     first, second = set(seen[:300]), set(seen[300:])
     everything = len(first | second)
     assert 0.08 * everything <= len(second - first) <= 0.1 * everything + 1
+
+
+def earning(quality: Callable[[int], float], price: float = 0.1, limit: int = 6000) -> tuple[EarningSchedule, int]:
+    """A schedule whose withheld photographs have the `quality` (dB) at each iteration; and how many it had."""
+    schedule = EarningSchedule(limit, every=100, price=price, before=1500, fall=0.5)
+    iteration = 0
+    while schedule.factor(iteration) is not None:
+        if schedule.due(iteration):
+            schedule.look(iteration, WithheldLook(0.0, quality(iteration) + np.array([-0.1, 0.0, 0.1])))
+        iteration += 1
+    return schedule, iteration
+
+
+def test_iterations_end_when_they_gain_less_than_their_time_is_worth():
+    # Half a decibel for each doubling of the iterations: worth it until the time hardly doubles any more.
+    slow = earning(lambda n: 20 + 0.5 * np.log2(n))
+    fast = earning(lambda n: 20 + 0.02 * np.log2(n))
+    never = earning(lambda n: 20.0)
+    assert slow[1] == 6000
+    assert never[1] == 1200  # eight looks, and half as many iterations in which the rates fall
+    assert 1200 <= fast[1] < 1500
+    assert all(stretch.pays for stretch in slow[0].earned)
+    assert [stretch.pays for stretch in never[0].earned] == [False]
+    assert never[0].earned[0].standard_error == pytest.approx(0, abs=1e-9)
+
+
+def test_a_higher_price_gives_fewer_iterations():
+    def quality(iteration: int) -> float:
+        return 25 - 4 * np.exp(-iteration / 800)
+
+    counts = [earning(quality, price)[1] for price in (0.01, 0.1, 0.5, 2.0)]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] > counts[-1]
+
+
+def test_what_was_earned_is_a_decision():
+    decision = iterations_decision(earning(lambda n: 25 - 4 * np.exp(-n / 400))[0].earned, 3000)
+    assert decision.chosen == "3000 iterations"
+    assert [rung.bought for rung in decision.rungs] == [True] * (len(decision.rungs) - 1) + [False]
+    assert all(rung.gain is not None for rung in decision.rungs)
+    many = earning(lambda n: float(n), limit=9000)[0].earned
+    assert len(iterations_decision(many, 9000).rungs) <= 40

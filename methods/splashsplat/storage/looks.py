@@ -1,0 +1,77 @@
+"""The appearance as it is stored: what was learned of carriers by values.py, heads and glass beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from splashbench.observe.grid import Grid
+
+from ..appearance.decoder import Decoder
+from ..appearance.fitting import Appearance
+from ..appearance.glass import Glass
+from ..appearance.sensitivity import Sensitivity
+from .rows import POSITION_STEPS
+from .values import StoredValues, read_values, store_values
+
+#: Tables of glass, each with its number of dimensions.
+GLASS_RANKS: Mapping[str, int] = {
+    "positions": 2,
+    "log_scales": 2,
+    "quaternions": 2,
+    "opacities": 1,
+    "colors": 2,
+    "slopes": 3,
+}
+_VALUES: Mapping[str, int] = {"center": 1, "basis": 2, "coarseness": 1, "coefficients": 2}
+_HEADS, _GLASS = "heads.", "glass."
+# Log-scales are the last ones of a carrier's values.
+_SCALES = 3
+
+
+def appearance_ranks(decoder: Decoder, with_glass: bool) -> dict[str, int]:
+    """Dimensions of all arrays of the file."""
+    heads = {f"{_HEADS}{name}": value.ndim for name, value in decoder.state_dict().items()}
+    glass = {f"{_GLASS}{name}": rank for name, rank in GLASS_RANKS.items()} if with_glass else {}
+    return {**_VALUES, **heads, **glass}
+
+
+def learned_values(appearance: Appearance) -> np.ndarray:
+    """Features and log-scales of every carrier side by side, float32 [N, D]."""
+    return np.asarray(torch.cat([appearance.features, appearance.log_scales], dim=1).numpy())
+
+
+def appearance_arrays(
+    appearance: Appearance, sensitivity: Sensitivity, step: float, grid: Grid
+) -> dict[str, np.ndarray]:
+    """What is stored of an appearance; sensitivity, step: see `store_values`.
+
+    Glass stands in half precision, its positions in steps of the transport grid.
+    """
+    stored = store_values(learned_values(appearance), sensitivity, step)
+    heads = {f"{_HEADS}{name}": value.numpy() for name, value in appearance.decoder.state_dict().items()}
+    glass: dict[str, np.ndarray] = {}
+    if appearance.glass is not None:
+        glass = {f"{_GLASS}{name}": table.half().numpy() for name, table in appearance.glass.tables.items()}
+        places = (appearance.glass.positions.numpy() - grid.origin) / grid.voxel
+        glass[f"{_GLASS}positions"] = np.rint(places * POSITION_STEPS).astype(np.int32)
+    return {**vars(stored), **heads, **glass}
+
+
+def read_appearance(arrays: Mapping[str, np.ndarray], decoder: Decoder, grid: Grid) -> Appearance:
+    """The appearance of what `appearance_arrays` gave; `decoder` gets its weights.
+
+    Raises ValueError or RuntimeError where it does not fit together.
+    """
+    values = read_values(StoredValues(**{name: arrays[name] for name in _VALUES}))
+    if values.shape[1] != decoder.settings.feature_size + _SCALES:
+        raise ValueError(f"{values.shape[1]} values of a carrier are not {decoder.settings.feature_size} + {_SCALES}")
+    decoder.load_state_dict({name: torch.from_numpy(arrays[f"{_HEADS}{name}"]) for name in decoder.state_dict()})
+    glass = None
+    if f"{_GLASS}positions" in arrays:
+        tables = {name: arrays[f"{_GLASS}{name}"] for name in GLASS_RANKS}
+        glass = Glass.of_tables(tables | {"positions": grid.to_scene(tables["positions"] / POSITION_STEPS)})
+    features, scales = (torch.from_numpy(part.copy()) for part in np.split(values, [-_SCALES], axis=1))
+    return Appearance(features, scales, decoder, glass)

@@ -1,0 +1,72 @@
+"""A track as it is stored: carriers by rows.py, the motion and phi in whole numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from splashbench.observe.grid import Grid
+
+from ..carriers.subframe import Track
+from ..motion.fall import falls_of, table_of
+from ..motion.steps import Motion
+from ..motion.velocity import Factor
+from .rows import VELOCITY_STEPS, StoredRows, read_rows, store_rows, stored_order, whole_velocities
+from .signed_distance import coarse_distance, read_distance, store_distance
+
+#: Arrays of the files of a track, each with its number of dimensions; `deformation` is optional.
+CARRIERS: Mapping[str, int] = {"births": 1, "lives": 1, "cells": 1, "within": 2, "residuals": 2}
+DEFORMATION: Mapping[str, int] = {"deformation": 3}
+MOTION: Mapping[str, int] = {"velocities": 5, "jets": 2, "turn": 2}
+DISTANCE: Mapping[str, int] = {"phi": 4}
+
+
+def stored_track(track: Track, times: np.ndarray, carried: bool, distance_steps: int) -> Track:
+    """`track` in the precision in which it is stored, its carriers numbered anew.
+
+    times: [T] of the frames, seconds. carried: whether the motion is what moved the carriers; else their F is stored.
+    distance_steps: of phi to either side, see `reach`.
+    """
+    packed = coarse_distance(track.phi, distance_steps)
+    ordered = stored_order(track.carriers, track.grid.shape)
+    return read_track(
+        track_arrays(replace(track, carriers=ordered, phi=packed), carried), track.grid, times, track.motion.factor
+    )
+
+
+def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]]:
+    """What is stored of a track, by file. Of one that `stored_track` gave, this loses nothing."""
+    control = whole_velocities(track.motion.velocities)
+    rows = dict(vars(store_rows(track.carriers, control, track.motion, track.grid)))
+    if not carried:
+        rows["deformation"] = track.carriers.deformation.astype(np.float16)
+    jets, turn = table_of(track.motion.falls)
+    return {
+        "carriers": rows,
+        "motion": {"velocities": control, "jets": jets, "turn": turn},
+        "distance": {"phi": store_distance(track.phi)},
+    }
+
+
+def read_track(arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times: np.ndarray, factor: Factor) -> Track:
+    """The track of what `track_arrays` gave. Raises ValueError where it does not fit together."""
+    n_frames = len(times)
+    control = arrays["motion"]["velocities"]
+    if control.shape[0] != max(n_frames - 1, 0) or control.shape[4] != 3 or min(control.shape[1:4]) < 2:
+        raise ValueError(f"velocities of shape {control.shape} do not fit {n_frames} frames")
+    stored = arrays["distance"]["phi"]
+    if stored.dtype != np.int8 or stored.shape != (n_frames, *grid.shape):
+        raise ValueError(f"phi is {stored.dtype} {stored.shape}, not int8 of {n_frames} frames on {grid.shape} nodes")
+    falls = falls_of(arrays["motion"]["jets"], arrays["motion"]["turn"], grid, times)
+    motion = Motion(control.astype(np.float32) / np.float32(VELOCITY_STEPS), factor, falls)
+    phi = read_distance(stored)
+    rows = StoredRows(**{name: arrays["carriers"][name] for name in CARRIERS})
+    carriers = read_rows(rows, control, motion, phi, grid)
+    deformation = arrays["carriers"].get("deformation")
+    if deformation is not None:
+        if deformation.shape != carriers.deformation.shape:
+            raise ValueError(f"deformation of shape {deformation.shape} does not fit {len(carriers.ids)} rows")
+        carriers = replace(carriers, deformation=deformation.astype(np.float32))
+    return Track(grid, carriers, motion, phi)

@@ -1,0 +1,48 @@
+"""A reader of fitted liquids that uses nothing of splashbench, written from storage/FORMAT.md alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+
+def read(directory: Path) -> dict[str, list[np.ndarray] | np.ndarray]:
+    """Of every frame the carriers' numbers and places (voxels), phi (voxels), and the carriers' values [N, D]."""
+    header = json.loads((directory / "liquid.json").read_text())
+    rows, motion, distance, look = (
+        np.load(directory / f"{name}.npz") for name in ("carriers", "motion", "distance", "appearance")
+    )
+    shape = np.array(header["grid"]["shape"])
+    factor = np.broadcast_to(np.array(header["factor"], dtype=float), 3)
+    births = np.repeat(np.arange(len(rows["births"])), rows["births"])
+    ends = births + rows["lives"]
+    cells = np.stack(np.unravel_index(np.cumsum(rows["cells"].astype(int)), shape), axis=1)
+    place = cells * 32 + rows["within"]
+    moves = iter(rows["residuals"].astype(int))
+    numbers, places = [], []
+    for t in range(len(header["times"])):
+        for number in np.flatnonzero((births < t) & (ends > t)):
+            velocity = _velocity(motion["velocities"][t - 1], factor, place[number] / 32)
+            led = place[number] + np.rint(velocity / 2).astype(int)
+            place[number] = np.clip(led + next(moves), 0, shape * 32 - 1)
+        numbers.append(np.flatnonzero((births <= t) & (ends > t)))
+        places.append(place[numbers[-1]] / 32)
+    assert next(moves, None) is None
+    phi = np.cumsum(distance["phi"].astype(int), axis=0) / 4 + 1 / 8
+    coefficients = look["coefficients"].T.astype(float) * 2.0 ** look["coarseness"][:, None]
+    return {"ids": numbers, "places": places, "phi": phi, "values": coefficients @ look["basis"] + look["center"]}
+
+
+def _velocity(control: np.ndarray, factor: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """In 1/64 voxel a frame at `place` [3] (voxels), linear between control nodes."""
+    nodes = np.array(control.shape[:3])
+    at = np.clip((place - (factor - 1) / 2) / factor, 0, nodes - 1)
+    low = np.minimum(at.astype(int), nodes - 2)
+    share = at - low
+    total = np.zeros(3)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.prod(np.where(np.array(corner) == 1, share, 1 - share))
+        total = total + weight * control[tuple(low + corner)]
+    return total

@@ -1,0 +1,253 @@
+"""What is stored of a liquid: the same whole numbers from any reader, within tolerance; damaged files are refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import resource
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Run
+from splashbench.scene import Scene
+from splashbench_methods.splashsplat import SplashSplat
+from splashbench_methods.splashsplat.appearance.sensitivity import Sensitivities, Sensitivity
+from splashbench_methods.splashsplat.method import FittedSplashSplat
+from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.storage import rows, signed_distance, values
+from splashbench_methods.splashsplat.storage.tolerance import Trial, longest_step
+
+FILES = ("liquid.json", "carriers.npz", "motion.npz", "distance.npz", "appearance.npz")
+
+
+@pytest.fixture(scope="module")
+def reader() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("reader", Path(__file__).with_name("reader.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def fit(scene: Scene, **settings: object) -> tuple[FittedSplashSplat, Run]:
+    overrides = {"hull_cells": 40, "transport_cells": 20, "control_cells": 6, "iterations": 40, "voxel_pixels": 0}
+    run = Run()
+    config = SplashSplat.Config.preset("quick", overrides | settings)
+    return SplashSplat().fit(scene.training(), config, run), run
+
+
+@pytest.fixture(scope="module")
+def fitted(balls: Scene) -> tuple[FittedSplashSplat, Run]:
+    return fit(balls)
+
+
+def test_a_reader_written_from_the_description_finds_the_same(
+    fitted: tuple[FittedSplashSplat, Run], reader: ModuleType, tmp_path: Path
+) -> None:
+    liquid = fitted[0].liquid
+    liquid.save(tmp_path)
+    found = reader.read(tmp_path)
+    for t in range(len(liquid.times)):
+        own = liquid.carriers.rows(t)
+        np.testing.assert_array_equal(found["ids"][t], liquid.carriers.ids[own])
+        np.testing.assert_array_equal(found["places"][t], liquid.carriers.positions[own])
+    np.testing.assert_array_equal(found["phi"] * 16, liquid.phi)
+    learned = np.concatenate([liquid.appearance.features.numpy(), liquid.appearance.log_scales.numpy()], axis=1)
+    np.testing.assert_allclose(found["values"], learned, atol=1e-4)
+
+
+def test_storing_what_was_loaded_gives_the_same_bytes(fitted: tuple[FittedSplashSplat, Run], tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    fitted[0].liquid.save(tmp_path / "a")
+    Liquid.load(tmp_path / "a").save(tmp_path / "b")
+    for name in FILES:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+def test_rounding_is_within_the_tolerance_and_a_wider_one_takes_fewer_bytes(balls: Scene) -> None:
+    sizes = []
+    for tolerance in (0.001, 0.03, 0.3):
+        found, run = fit(balls, storage_tolerance=tolerance)
+        (decision,) = [made for made in run.decisions if made.basis == "tolerance"]
+        taken = next(rung for rung in decision.rungs if rung.bought)
+        assert float(taken.reason.split()[1]) <= 100 * tolerance
+        sizes.append(found.liquid.stored_bytes)
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < sizes[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_thousand_damages_raise_one_line_and_allocate_no_more_than_the_files_say(
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path, seed: int
+) -> None:
+    fitted[0].liquid.save(tmp_path)
+    rng = np.random.default_rng(seed)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    errors = []
+    for _ in range(500):
+        path = tmp_path / FILES[rng.integers(len(FILES))]
+        whole = path.read_bytes()
+        broken = bytearray(whole)
+        kind = rng.integers(3)
+        if kind == 0:
+            broken[rng.integers(len(broken))] ^= 1 << int(rng.integers(8))
+        elif kind == 1:
+            start = int(rng.integers(len(broken)))
+            broken[start : start + 16] = rng.integers(0, 256, len(broken[start : start + 16]), dtype=np.uint8).tobytes()
+        else:
+            del broken[int(rng.integers(len(broken))) :]
+        path.write_bytes(bytes(broken))
+        try:
+            Liquid.load(tmp_path)
+        except SplashbenchError as error:
+            errors.append(str(error))
+        path.write_bytes(whole)
+    assert len(errors) > 300
+    assert all("\n" not in error and str(tmp_path) in error for error in errors)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 200_000  # kilobytes
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("carriers", lambda a: a | {"lives": a["lives"] + 1}),
+        ("carriers", lambda a: a | {"births": a["births"][:-1]}),
+        ("carriers", lambda a: a | {"cells": a["cells"] + 10**6}),
+        ("carriers", lambda a: a | {"residuals": a["residuals"][:-1]}),
+        ("motion", lambda a: a | {"velocities": a["velocities"][:-1]}),
+        ("distance", lambda a: a | {"phi": a["phi"][:, :-1]}),
+        ("distance", lambda a: a | {"phi": np.full_like(a["phi"], 100)}),
+        ("appearance", lambda a: a | {"coefficients": a["coefficients"][:-1]}),
+        ("appearance", lambda a: a | {"coarseness": a["coarseness"] + 100}),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_named(
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path, name: str, change: object
+) -> None:
+    fitted[0].liquid.save(tmp_path)
+    path = tmp_path / f"{name}.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **change(arrays))  # type: ignore[operator]
+    with pytest.raises(SplashbenchError, match=r"does not fit|has \d+ carriers"):
+        Liquid.load(tmp_path)
+
+
+def test_phi_is_stored_in_quarters_of_a_voxel_and_keeps_its_sign() -> None:
+    packed = np.random.default_rng(0).integers(-127, 128, (5, 4, 3, 6)).astype(np.int8)
+    for steps in (signed_distance.reach(2.0, 20.0), signed_distance.reach(2.0, 3.0)):
+        coarse = signed_distance.coarse_distance(packed, steps)
+        np.testing.assert_array_equal(signed_distance.read_distance(signed_distance.store_distance(coarse)), coarse)
+        np.testing.assert_array_equal(coarse < 0, packed < 0)
+        near = np.abs(packed) < 4 * steps
+        assert np.abs(coarse.astype(int) - packed)[near].max() <= 2
+    assert signed_distance.reach(2.0, 20.0) < signed_distance.reach(2.0, 3.0)
+
+
+def test_directions_that_no_photograph_shows_cost_nothing() -> None:
+    rng = np.random.default_rng(0)
+    learned = rng.normal(size=(4000, 6)).astype(np.float32)
+    metric = np.diag([1.0, 1.0, 1.0, 1.0, 1e-9, 1e-9])
+    stored = values.store_values(learned, Sensitivity(metric, np.ones(4000, np.float32)), 0.1)
+    read = values.read_values(stored)
+    assert np.abs(read - learned)[:, :4].max() <= 0.1 * 4**0.5
+    used = [len(np.unique(row)) for row in stored.coefficients]
+    assert min(used[:4]) > 50
+    assert max(used[4:]) <= 3
+
+
+def test_carriers_that_make_up_little_are_stored_more_coarsely() -> None:
+    learned = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    weights = np.where(np.arange(1000) < 500, 1.0, 1 / 16).astype(np.float32)
+    stored = values.store_values(learned, Sensitivity(np.eye(3), weights), 0.05)
+    assert set(stored.coarseness[:500]) == {0}
+    assert set(stored.coarseness[500:]) == {2}
+
+
+def test_sensitivity_is_what_the_derivative_says() -> None:
+    # Pixels are a linear function of the values: J' J is known.
+    rng = np.random.default_rng(0)
+    jacobians = torch.from_numpy(rng.normal(size=(50, 12, 4)).astype(np.float32) * np.array([1, 2, 3, 4], np.float32))
+    jacobians[25:] *= 0.1
+    signs = np.random.default_rng(1)
+
+    added = Sensitivities(50, 4)
+    for _ in range(400):
+        drawn = torch.from_numpy(signs.integers(0, 2, (50, 12)).astype(np.float32) * 2 - 1)
+        added.add(torch.arange(50), torch.einsum("np,npd->nd", drawn, jacobians))
+    found = added.found()
+    exact = torch.einsum("npd,npe->de", jacobians, jacobians) / 50 * 400
+    np.testing.assert_allclose(found.metric.diagonal(), exact.diagonal(), rtol=0.1)
+    assert found.carriers.mean() == pytest.approx(1, abs=1e-3)
+    assert found.carriers[:25].mean() / found.carriers[25:].mean() == pytest.approx(100, rel=0.15)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 100.0])
+def test_the_longest_step_is_found_in_few_trials(scale: float) -> None:
+    trials = longest_step(0.03, 0.1, lambda step: Trial(step, scale * step**2, 0, 0))
+    best = max(trial.step for trial in trials if trial.added <= 0.03)
+    assert 0.85 < best / (0.03 / scale) ** 0.5 <= 1
+    assert len(trials) <= 6
+
+
+def test_where_no_step_is_within_tolerance_the_search_ends() -> None:
+    assert len(longest_step(0.01, 0.1, lambda step: Trial(step, 1.0, 0, 0))) < 30
+
+
+def test_positions_survive_whatever_the_motion_says(fitted: tuple[FittedSplashSplat, Run]) -> None:
+    liquid = fitted[0].liquid
+    control = rows.whole_velocities(np.random.default_rng(0).normal(0, 3, liquid.motion.velocities.shape))
+    stored = rows.store_rows(liquid.carriers, control, liquid.motion, liquid.grid)
+    read = rows.read_rows(stored, control, liquid.motion, liquid.phi, liquid.grid)
+    np.testing.assert_array_equal(read.positions, liquid.carriers.positions)
+    np.testing.assert_array_equal(read.ids, liquid.carriers.ids)
+
+
+def test_a_model_of_an_earlier_version_is_read_but_not_written(
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path
+) -> None:
+    liquid = fitted[0].liquid
+    carriers, look = liquid.carriers, liquid.appearance
+    header = {
+        "format": 3,
+        "times": [float(t) for t in liquid.times],
+        "grid": {"origin": liquid.grid.origin.tolist(), "voxel": liquid.grid.voxel, "shape": liquid.grid.shape},
+        "factor": liquid.motion.factor,
+        "carriers": carriers.count,
+        "carried": True,
+        "decoder": dict(vars(look.decoder.settings)),
+    }
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
+    steps = np.float32(65535 / max(liquid.grid.shape))
+    np.savez(
+        tmp_path / "carriers.npz",
+        starts=carriers.starts,
+        ids=carriers.ids,
+        positions=np.round(carriers.positions * steps).astype(np.uint16),
+        deformation=carriers.deformation.astype(np.float16),
+        phi=carriers.phi.astype(np.float16),
+    )
+    jets = np.zeros((len(liquid.times) - 1, 9))
+    np.savez(tmp_path / "velocity.npz", velocities=liquid.motion.velocities, jets=jets, turn=np.eye(3))
+    np.savez(tmp_path / "phi.npz", phi=liquid.phi)
+    heads = {f"heads.{name}": value.numpy() for name, value in look.decoder.state_dict().items()}
+    np.savez(tmp_path / "appearance.npz", features=look.features.numpy(), log_scales=look.log_scales.numpy(), **heads)
+    loaded = Liquid.load(tmp_path)
+    np.testing.assert_allclose(loaded.carriers.positions, carriers.positions, atol=1e-2)
+    torch.testing.assert_close(loaded.appearance.features, look.features)
+    with pytest.raises(SplashbenchError, match="earlier version"):
+        loaded.save(tmp_path)
+    # Version 0.1 spelled the heads "colour".
+    header["decoder"]["colour_width"] = header["decoder"].pop("color_width")
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
+    british = {name.replace("color", "colour"): head for name, head in heads.items()}
+    np.savez(tmp_path / "appearance.npz", features=look.features.numpy(), log_scales=look.log_scales.numpy(), **british)
+    torch.testing.assert_close(Liquid.load(tmp_path).appearance.decoder.state_dict(), look.decoder.state_dict())
