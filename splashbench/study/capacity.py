@@ -145,8 +145,9 @@ def capacity_frame(capacity: CapacityPlan, store: Store) -> pd.DataFrame:
 
 
 def curves(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """By scene, and as `MEAN` where there are several: a row per rung, with means of figures and `ok` and `runs`.
+    """By scene, and as `MEAN` where there are several: a row per rung, with means of figures.
 
+    Besides: psnr_std, standard deviation of psnr over seeds, dB; runs, how many there are; ok, how many came through.
     A scene's figures are means over the seeds that came through. Those of `MEAN` are means over seeds of means over
     scenes, of seeds that have the figure on every scene: one over the easier scenes would flatter. Means of costs are
     geometric, since a cost counts by its doublings.
@@ -162,11 +163,13 @@ def _curve(frame: pd.DataFrame, n_scenes: int) -> pd.DataFrame:
     values = frame[["rung", "seed", *names]].copy()
     logarithmic = list(_LOGARITHMIC)
     values[logarithmic] = np.log(values[logarithmic].where(values[logarithmic] > 0))
-    by_seed = values.groupby(["rung", "seed"])[names]
-    means = by_seed.mean().where(by_seed.count() == n_scenes).groupby("rung").mean()
+    groups = values.groupby(["rung", "seed"])[names]
+    by_seed = groups.mean().where(groups.count() == n_scenes)
+    by_rung = by_seed.groupby("rung")
+    means = by_rung.mean()
     means[logarithmic] = np.exp(means[logarithmic])
     ok = frame.assign(ok=frame["status"] == "ok").groupby("rung")["ok"]
-    return means.assign(ok=ok.sum(), runs=ok.count())
+    return means.assign(psnr_std=by_rung["psnr"].std(), ok=ok.sum(), runs=ok.count())
 
 
 def rungs_of(curve: pd.DataFrame) -> list[Rung]:

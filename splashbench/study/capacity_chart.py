@@ -119,6 +119,7 @@ def _panel(
     if not drawn:
         axes.set_xticks([])
         axes.set_yticks([])
+        axes.spines[:].set_visible(False)
         axes.text(0.5, 0.5, "no figures", transform=axes.transAxes, ha="center", color=_GREY)
         return
     # Ticks are doublings, which the price counts; and what lies between where there are few.

@@ -14,7 +14,7 @@ from splashbench.harness.contract import Method
 from splashbench.markdown import bullets, one_line
 from splashbench.markdown import table as markdown_table
 from splashbench.score.metrics import METRICS
-from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, NO_FIGURE, shown
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, NO_FIGURE, in_shown_unit, shown, shown_with_spread
 from splashbench.study.capacity import CapacityPlan, capacity_frame, curves, rungs_of
 from splashbench.study.capacity_chart import draw_capacity
 from splashbench.study.job import Store
@@ -24,6 +24,13 @@ from splashbench.study.table import NOT_RUN
 from splashbench.study.table_markdown import scenes_and_machines
 
 _STILL_RISING = "no knee: still rising"
+#: What lies beyond a knee, for people.
+_MEANING = {
+    "overfitting": "overfitting",
+    "worse": "test views get worse",
+    "too dear": "gains below their price",
+    "plateau": "a plateau",
+}
 
 
 def find_knees(capacity: CapacityPlan, store: Store) -> dict[str, Knee]:
@@ -65,14 +72,9 @@ def _unclimbed(capacity: CapacityPlan, knee: Knee) -> str:
 def _beyond(knee: Knee) -> str:
     test = f"test views {knee.test_change:+.2f} dB"
     train = f", training views {knee.train_change:+.2f} dB" if isfinite(knee.train_change) else ""
-    meaning = {
-        "overfitting": "overfitting",
-        "worse": "worse, and no overfitting: training views do not gain",
-        "too dear": "gains below their price",
-        "plateau": "a plateau",
-    }[str(knee.beyond)]
-    if knee.beyond == "worse" and not train:
-        meaning = "worse; no figures of training views"
+    meaning = _MEANING[str(knee.beyond)]
+    if knee.beyond == "worse":
+        meaning += ", and no overfitting: training views do not gain" if train else "; no figures of training views"
     return f"{meaning} ({test}{train} up to rung {knee.last})"
 
 
@@ -94,7 +96,8 @@ def _headline(by_name: Mapping[str, pd.DataFrame], knees: Mapping[str, Knee]) ->
     row = curve.loc[knee.rung]
     return (
         f"knee at rung {knee.rung} of {len(curve)}, {row['psnr']:.2f} dB with "
-        f"{shown(METRICS['storage_bytes'], row['storage_bytes'])} MB in {row['fit_seconds']:.3g} s"
+        f"{in_shown_unit(METRICS['storage_bytes'], row['storage_bytes']):.3g} MB in {row['fit_seconds']:.3g} s; "
+        f"beyond it {_MEANING[str(knee.beyond)]}"
     )
 
 
@@ -176,7 +179,7 @@ def _rungs(capacity: CapacityPlan, curve: pd.DataFrame, mixed: bool) -> str:
             "fit (s)": f"{row['fit_seconds']:.3g}" if isfinite(row["fit_seconds"]) else NO_FIGURE,
             "memory (MiB)": shown(METRICS["peak_memory_bytes"], row["peak_memory_bytes"]),
             "primitives": shown(METRICS["primitives_per_frame"], row["primitives_per_frame"]),
-            "PSNR": shown(METRICS["psnr"], row["psnr"]),
+            "PSNR": shown_with_spread(METRICS["psnr"], row["psnr"], row["psnr_std"]),
             "of training": shown(METRICS["psnr"], row["train_psnr"]),
             "gap": shown(METRICS["psnr"], row["train_psnr"] - row["psnr"]),
             "net gain": net.get(rung, NO_FIGURE),
@@ -236,6 +239,8 @@ def _conditions(capacity: CapacityPlan, store: Store, frame: pd.DataFrame) -> st
             for scene, of_scene in views.items()
         ),
     ]
+    if frame["psnr"].notna().any() and frame["lpips"].isna().all():
+        lines.append("No LPIPS, since there are no weights: give --lpips-weights")
     at_once = max((entry.at_once for entry in entries), default=1)
     lines += [f"{at_once} runs at once: fit times compare poorly"] if at_once > 1 else []
     return bullets(map(one_line, lines)) + "\n" + scenes_and_machines(plan.scenes, results)

@@ -54,7 +54,9 @@ def test_every_rung_has_a_row_for_each_seed(study: Path, balls: Scene) -> None:
 
 def test_the_knee_and_overfitting_are_told(study: Path) -> None:
     page = (study / "capacity.md").read_text(encoding="utf-8")
-    assert page.startswith("# Capacity of growing, preset best: knee at rung 3 of 4, 12.")
+    assert page.startswith("# Capacity of growing, preset best: knee at rung 3 of 4, 12.66 dB with 0.00")
+    assert "beyond it overfitting\n" in page
+    assert "12.66 ± 0.00" in page
     assert "balls: knee at rung 3 (size=4); beyond it overfitting (test views -" in page
     assert "| 3 | size=4 | 2 of 2 |" in page
     assert "Satopaa et al. 2011" in page
