@@ -86,7 +86,7 @@ def _panel(
     cost: str,
     metric: str,
 ) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
     drawn = False
     for number, (name, curve) in enumerate(curves.items()):
@@ -122,11 +122,10 @@ def _panel(
         axes.spines[:].set_visible(False)
         axes.text(0.5, 0.5, "no figures", transform=axes.transAxes, ha="center", color=_GREY)
         return
-    # Ticks are doublings, which the price counts; and what lies between where there are few.
+    # Ticks are doublings, which the price counts; within less than two of them, round numbers.
     axes.set_xscale("log", base=2)
     low, high = axes.dataLim.intervalx
-    steps = (1.0,) if high / low > 6 else (1.0, 1.5) if high / low > 3 else (1.0, 1.2, 1.4, 1.6, 1.8)
-    axes.xaxis.set_major_locator(LogLocator(base=2, subs=steps, numticks=8))
+    axes.xaxis.set_major_locator(LogLocator(base=2, numticks=8) if high / low >= 4 else MaxNLocator(5))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
     axes.minorticks_off()
     axes.margins(x=0.1, y=0.12)
@@ -176,7 +175,5 @@ def _legend(figure: Any, curves: Mapping[str, pd.DataFrame], knees: Mapping[str,
 
 
 def _plain(value: float) -> str:
-    """ "0.06", "16" or "16k"."""
-    if value >= 10_000:
-        return f"{value / 1000:.0f}k"
-    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+    """ "0.0625", "16", "8192" or "16.4k"."""
+    return f"{value / 1000:.3g}k" if value >= 10_000 else f"{value:.4g}"

@@ -61,7 +61,8 @@ def knee_text(capacity: CapacityPlan, knee: Knee) -> str:
         if not knee.rising:
             return f"no knee: rung {knee.last} alone has figures"
         return f"{_STILL_RISING} at rung {knee.last}{_unclimbed(capacity, knee)}"
-    return f"knee at rung {knee.rung} ({capacity.ladder.text(knee.rung)}); beyond it {_beyond(knee)}"
+    found = f"knee at rung {knee.rung} ({capacity.ladder.text(knee.rung)}); beyond it {_beyond(knee)}"
+    return found + _unclimbed(capacity, knee)
 
 
 def _unclimbed(capacity: CapacityPlan, knee: Knee) -> str:

@@ -56,6 +56,7 @@ def test_the_knee_and_overfitting_are_told(study: Path) -> None:
     page = (study / "capacity.md").read_text(encoding="utf-8")
     assert page.startswith("# Capacity of growing, preset best: knee at rung 3 of 4, 12.66 dB with 0.00")
     assert "beyond it overfitting\n" in page
+    assert "larger rung" not in page
     assert "12.66 ± 0.00" in page
     assert "balls: knee at rung 3 (size=4); beyond it overfitting (test views -" in page
     assert "| 3 | size=4 | 2 of 2 |" in page
@@ -91,6 +92,15 @@ def test_failed_rungs_are_rows_and_the_curve_goes_on_rising(balls_directory: Pat
     assert "no knee: still rising at rung 2; 1 larger rung has no figures" in page
     assert "- rung 3, balls, seed 0: crashed: RuntimeError: too large" in page
     assert "Runs: 2 ok, 1 failed" in page
+
+
+def test_rungs_that_failed_above_a_knee_are_told(balls_directory: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = ["study", "capacity", GROWING, str(out), "--scenes", str(balls_directory), "--set", "fails_from=16"]
+    assert main([*command, "--ladder", "size=2,4,8,16,32"]) == 0
+    page = (out / "capacity.md").read_text(encoding="utf-8")
+    assert "balls: knee at rung 2 (size=4); beyond it a plateau (" in page
+    assert "up to rung 3); 2 larger rungs have no figures." in page
 
 
 def test_training_views_that_a_model_cannot_show_are_told(balls_directory: Path, tmp_path: Path) -> None:
