@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -41,6 +41,14 @@ class DeformableSettings(SplattingSettings):
             "reset_every": 3000, "reset_until": 0.75, "rates": "published", "longest_side": 16384,
         },
     }  # fmt: skip
+    #: the third rung has the Gaussians, the width and the steps of "quick"
+    capacity: ClassVar[Mapping[str, Sequence[Any]]] = {
+        "iterations": (2000, 4000, 8000, 16_000, 32_000),
+        "static_points": (625, 1250, 2500, 5000, 10_000),
+        "hull_points": (625, 1250, 2500, 5000, 10_000),
+        "max_gaussians": (1500, 3000, 6000, 12_000, 24_000),
+        "width": (32, 48, 64, 96, 128),
+    }
 
     warm_up: float = Field(default=0.1, ge=0, le=1)
     time_noise: float = Field(default=0.1, ge=0, le=10)

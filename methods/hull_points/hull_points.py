@@ -14,6 +14,7 @@ from splashbench.render import rasterize_arrays
 
 class HullPointsSettings(MethodConfig):
     presets: ClassVar[dict] = {"best": {}, "quick": {"points": 2000}}  # the first one is the default
+    capacity: ClassVar[dict] = {"points": (500, 2000, 8000, 32000, 128000), "cells": (32, 48, 64, 96, 128)}
     points: int = 8000  # per frame
     cells: int = 64  # of the hull's grid, along its longest side
 

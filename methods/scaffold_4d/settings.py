@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -43,6 +43,13 @@ class Scaffold4DSettings(DynamicFitSettings):
             "longest_side": 16384,
         },
     }  # fmt: skip
+    #: the third rung has the anchors and the steps of "quick"
+    capacity: ClassVar[Mapping[str, Sequence[Any]]] = {
+        "iterations": (900, 1800, 3600, 7200, 14_400),
+        "static_points": (2000, 4000, 8000, 16_000, 32_000),
+        "hull_points": (7500, 15_000, 30_000, 60_000, 120_000),
+        "max_anchors": (12_500, 25_000, 50_000, 100_000, 200_000),
+    }
 
     children: int = Field(default=3, ge=1, le=32)
     max_anchors: int = Field(default=20_000, ge=10, le=5_000_000)

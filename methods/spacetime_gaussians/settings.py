@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -32,6 +32,13 @@ class SpacetimeSettings(SplattingSettings):
             "longest_side": 16384, "guided_from": 0.0533, "guided_until": 0.1, "hull_log_width": -2.0,
         },
     }  # fmt: skip
+    #: the third rung has the size and the steps of "quick"
+    capacity: ClassVar[Mapping[str, Sequence[Any]]] = {
+        "iterations": (1500, 3000, 6000, 12_000, 24_000),
+        "static_points": (1500, 3000, 6000, 12_000, 24_000),
+        "hull_points": (10_000, 20_000, 40_000, 80_000, 160_000),
+        "max_gaussians": (15_000, 30_000, 60_000, 120_000, 240_000),
+    }
 
     new_times: Literal["anywhere", "kept"] = "anywhere"
     hull_log_width: float = Field(default=-3.0, ge=-10, le=3)

@@ -6,7 +6,7 @@ is for a first look within minutes. The paper's ablations are `variant` and, wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
@@ -207,6 +207,14 @@ class SplashSplatConfig(MethodConfig):
         "shared_cells": "feature_cells",
         "withheld_share": "validation_share",
         "colour_weight": "color_weight",
+    }
+    #: the fourth rung is "best"; pixels limit the grids of larger ones (`voxel_pixels`)
+    capacity: ClassVar[Mapping[str, Sequence[Any]]] = {
+        "hull_cells": (96, 144, 208, 300, 416),
+        "transport_cells": (48, 72, 104, 150, 208),
+        "control_cells": (12, 18, 26, 38, 52),
+        "feature_size": (8, 8, 16, 16, 32),
+        "iterations": (500, 1000, 2000, 4000, 8000),
     }
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "best": {},

@@ -74,6 +74,13 @@ def add_seed(parser: argparse._ActionsContainer, help: str = "seed of every rand
     parser.add_argument("--seed", type=whole_number(0), default=0, help=f"{help} (default: 0)")
 
 
+def add_seeds(parser: argparse._ActionsContainer, help: str) -> None:
+    """Add `--seeds SEED ...`, empty where it is not given."""
+    parser.add_argument(
+        "--seeds", nargs="+", action="extend", type=whole_number(0), default=[], metavar="SEED", help=f"seeds {help}"
+    )
+
+
 def add_device(parser: argparse._ActionsContainer) -> None:
     """Add `--device`."""
     parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can use it")

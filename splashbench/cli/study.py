@@ -1,6 +1,7 @@
 """`splashbench study run SPEC OUT`: a table of runs that shows what a part of a method or of its input is worth.
 
 `splashbench study stress OUT`: what methods keep where recordings are worse.
+`splashbench study capacity METHOD OUT` is in study_capacity.py.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ import argparse
 import shlex
 from pathlib import Path
 
-from splashbench.cli.arguments import add_lpips_weights, add_settings, positive_number, whole_number
+from splashbench.cli import study_capacity
+from splashbench.cli.arguments import add_lpips_weights, add_seeds, add_settings, positive_number, whole_number
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say
 
@@ -64,7 +66,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         metavar="SCENE",
         help="folders of scenes, in place of the spec's",
     )
-    _add_seeds(parser, "seeds, in place of the spec's")
+    add_seeds(parser, "in place of the spec's")
     add_settings(parser, "a setting of every row, such as the number of iterations; overrides the spec's", dest="base")
     parser.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
     parser.add_argument(
@@ -75,12 +77,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     add_lpips_weights(parser)
 
     _register_stress(actions)
-
-
-def _add_seeds(parser: argparse.ArgumentParser, text: str) -> None:
-    parser.add_argument(
-        "--seeds", nargs="+", action="extend", type=whole_number(0), default=[], metavar="SEED", help=text
-    )
+    study_capacity.register(actions)
 
 
 def _register_stress(actions: argparse._SubParsersAction) -> None:
@@ -124,7 +121,7 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
         metavar="1-5",
         help="which of the five (default: all)",
     )
-    _add_seeds(parser, "of methods and of what is drawn (default: 0)")
+    add_seeds(parser, "of methods and of what is drawn (default: 0)")
     parser.add_argument(
         "--every",
         type=whole_number(1),

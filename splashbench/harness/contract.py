@@ -10,7 +10,7 @@ from __future__ import annotations
 import textwrap
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -231,11 +231,13 @@ class MethodConfig(BaseModel):
     """Settings of a method. Subclass it with fields and fill `presets`: name -> the fields that differ.
 
     renamed: settings that had another name in an earlier version, old -> new; who gives the old one is told the new.
+    capacity: a ladder for `study capacity`: setting -> values from the smallest model to the largest, as many of each.
     """
 
     model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"best": {}}
     renamed: ClassVar[Mapping[str, str]] = {}
+    capacity: ClassVar[Mapping[str, Sequence[Any]]] = {}
 
     @classmethod
     def preset(cls, name: str, overrides: Mapping[str, Any] | None = None) -> MethodConfig:

@@ -16,6 +16,7 @@ class Request(BaseModel):
         phase: fit (scene -> model), import (an external code's output -> model), render (model -> test views).
         times: of the views to render, seconds by test camera; by default those of the scene's timesteps.
         only_views: render nothing but the views, and hand in no particles.
+        training_views: training views to render in place of the test views, timesteps by camera.
         checkpoints: folder for states of the fit under way; null takes none. marks: when, see checkpoints.py.
         importer: imports and renders a model instead of the method. source, export: what it reads it from.
     """
@@ -39,6 +40,7 @@ class Request(BaseModel):
     cache: str | None = None
     times: dict[str, list[float]] | None = None
     only_views: bool = False
+    training_views: dict[str, list[int]] | None = None
     checkpoints: str | None = None
     marks: list[float] = []
     budget: Budget = Budget()

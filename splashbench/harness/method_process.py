@@ -130,8 +130,7 @@ def _reporter(stream: TextIO) -> Callable[[float, str], None]:
 def _render(request: Request, method: Method | Importer, scene: TrainingScene) -> Outcome:
     fitted = method.load(Path(request.model), scene)
     output = Path(request.output)
-    times = request.times or {name: scene.camera_times[name].tolist() for name in scene.test_cameras}
-    views = [(scene.test_cameras[name], t, time) for name, seconds in times.items() for t, time in enumerate(seconds)]
+    views = _views(request, scene)
     counts = []
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         report = _reporter(stream)
@@ -143,9 +142,11 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
             write_view(output, camera.name, t, to_8bit(render.rgb), to_8bit(render.alpha))
             if request.exr:
                 write_exr(output / "exr" / camera.name / f"{t:06d}.exr", render.rgb, render.alpha)
-            report((i + 1) / len(views), "rendering the test views")
+            report(
+                (i + 1) / len(views), f"rendering the {'test' if request.training_views is None else 'training'} views"
+            )
     # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
-    bare = request.only_views or request.times is not None
+    bare = request.only_views or request.times is not None or request.training_views is not None
     particles = None if bare else fitted.particles()
     if particles is not None:
         check_particles(particles, scene.n_frames)
@@ -162,6 +163,15 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),
     )
+
+
+def _views(request: Request, scene: TrainingScene) -> list[tuple[Camera, int, float]]:
+    """What is rendered: camera, the timestep that its files are named by, and seconds."""
+    if request.training_views is not None:
+        pairs = [(scene.cameras[name], t) for name, steps in request.training_views.items() for t in steps]
+        return [(camera, t, _time(scene, camera, t)) for camera, t in pairs]
+    times = request.times or {name: scene.camera_times[name].tolist() for name in scene.test_cameras}
+    return [(scene.test_cameras[name], t, time) for name, seconds in times.items() for t, time in enumerate(seconds)]
 
 
 def _time(scene: TrainingScene, camera: Camera, t: int) -> float:

@@ -41,6 +41,7 @@ class ExecutionOptions:
         order: gives the missing runs in the order in which they are made, and may leave some out; it is asked for the
             next one once there is room for it. None for all, as planned.
         pictures: keep a render of each run, see `Store.picture_path`.
+        training: score training views too, see training_views.py; not of references.
     """
 
     only: tuple[str, ...] | None = None
@@ -51,6 +52,7 @@ class ExecutionOptions:
     tell: Callable[[str], None] = field(default=lambda line: None)
     order: Callable[[Sequence[PlannedRun]], Iterator[PlannedRun]] | None = None
     pictures: bool = False
+    training: bool = False
 
 
 @dataclass
@@ -70,7 +72,9 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
     with claimed(store):
         selected = [run for run in plan.runs if options.only is None or run.variant.name in options.only]
         with_lpips = "lpips" in plan.spec.metrics and load_lpips(options.lpips_weights)[0] is not None
-        missing = {run.digest: run for run in selected if _is_missing(run, store, with_lpips, options.retry)}
+        missing = {
+            run.digest: run for run in selected if _is_missing(run, store, with_lpips, options.retry, options.training)
+        }
         needed = {run.reference for run in missing.values()}
         in_table = {run.digest for run in plan.reference_row} & {run.reference for run in selected}
         references = [
@@ -88,7 +92,7 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
         return Tally(progress.ended, len({run.digest for run in selected}) - len(missing))
 
 
-def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) -> bool:
+def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool, training: bool = False) -> bool:
     """Whether the run is to be made: it does not exist, or it lacks a figure that can be computed now."""
     entry = store.entry(run.digest)
     if entry is None or entry.status == ERROR:
@@ -102,6 +106,7 @@ def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool) ->
         (with_lpips and result.value("lpips") is None)
         or (run.timing_frames > 0 and result.value("render_fps") is None)
         or (run.variant.unseen is not None and store.faded(entry) is None)
+        or (training and (entry.training is None or (retry and entry.training.status != "ok")))
     )
 
 
@@ -125,6 +130,7 @@ def _job(plan: StudyPlan, run: PlannedRun, out: Path, options: ExecutionOptions,
         keep=options.keep,
         at_once=options.jobs,
         picture=options.pictures,
+        training=options.training and not is_reference,
     )
 
 

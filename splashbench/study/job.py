@@ -20,6 +20,7 @@ from splashbench.scene import Scene
 from splashbench.score import Result, score_submission, shared_fields
 from splashbench.study.scenes import changed_scene
 from splashbench.study.spec import StudyVariant
+from splashbench.study.training_views import TrainingScore, score_training_views
 from splashbench.submission import Record, Status, Submission
 from splashbench.submission.faded import FadedSubmission
 
@@ -49,6 +50,7 @@ class Job(BaseModel):
     keep: bool
     at_once: int
     picture: bool = False
+    training: bool = False
 
 
 class RunEntry(BaseModel):
@@ -58,6 +60,7 @@ class RunEntry(BaseModel):
         result: name of its file in results/; null where there is none.
         faded: where timesteps were withheld, that of the control `faded` (submission/faded.py).
         at_once: how many runs shared the machine.
+        training: figures of training views, where they were asked for (training_views.py).
         seconds: duration of the run, scoring included.
     """
 
@@ -71,6 +74,7 @@ class RunEntry(BaseModel):
     faded: str | None = None
     record: Record | None = None
     train_views: list[str] = Field(default_factory=list)
+    training: TrainingScore | None = None
     at_once: int = 1
     seconds: float = 0.0
 
@@ -163,7 +167,7 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
         device=job.device,
         timeout_seconds=job.timeout_seconds,
         timing_frames=job.timing_frames,
-        keep_model=job.keep,
+        keep_model=job.keep or job.training,
         replace=True,
         cache=store.cache / "parts",
         withheld=job.variant.unseen,
@@ -184,6 +188,9 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     if job.variant.unseen and submission.status == Status.OK:
         control = FadedSubmission(submission, scene)
         faded = score_submission(scene, control, reference, weights, fields=shared_fields(original)).save(store.results)
+    training = None
+    if job.training and submission.status == Status.OK:
+        training = score_training_views(job.method, scene, submission, weights, job.timeout_seconds)
     if not job.keep and not job.is_reference:
         shutil.rmtree(place)
     return entry.model_copy(
@@ -194,6 +201,7 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
             "faded": faded.name if faded else None,
             "record": submission.record,
             "train_views": list(scene.train),
+            "training": training,
         }
     )
 

@@ -83,3 +83,61 @@ class Model(Fitted):
     def save(self, directory: Path) -> None:
         said = {"grey": self.grey, "shared": self.shared, "covered": self.covered}
         (directory / "model.json").write_text(json.dumps(said))
+
+
+class LadderSettings(Settings):
+    """Settings of `Growing`, and its ladder."""
+
+    capacity: ClassVar[dict] = {"size": (1, 2, 4, 8)}
+    #: of the model in kilobytes, of its fit in hundredths of a second
+    size: int = 1
+    #: from this size on no fit comes through
+    fails_from: int = 1000
+    #: from this size on test views become worse
+    overfits_from: int = 1000
+    #: whether the model can show training views
+    shows_training_views: bool = True
+
+
+class Growing(Grey):
+    """Shows training views the better the larger it is, and test views up to a size. Its model is its size."""
+
+    id, title, version, Config = "growing", "a size", "1", LadderSettings
+
+    def fit(self, scene: TrainingScene, config: LadderSettings, run: Run) -> Fitted:
+        if config.log:
+            with Path(config.log).open("a", encoding="utf-8") as stream:
+                stream.write(f"{config.size} {run.seed}\n")
+        if config.size >= config.fails_from:
+            raise RuntimeError("too large")
+        clock.sleep(0.01 * config.size)
+        return Grown(scene, config.model_dump())
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        return Grown(scene, json.loads((directory / "model.json").read_text()))
+
+
+class Grown(Fitted):
+    """What `Growing` fitted: `said` are its settings."""
+
+    def __init__(self, scene: TrainingScene, said: dict) -> None:
+        self.scene, self.said = scene, said
+
+    def render(self, camera: Camera, time: float) -> Render:
+        size, alpha = self.said["size"], np.ones((camera.height, camera.width), np.float32)
+        if camera.name in self.scene.train:
+            if not self.said["shows_training_views"]:
+                raise RuntimeError("for test views only")
+            t = int(np.abs(self.scene.camera_times[camera.name] - time).argmin())
+            truth = self.scene.image(camera.name, t).astype(np.float32) / 255
+            return Render(np.clip(truth + 0.3 / size, 0, 1), alpha)
+        # Of the balls a grey of .3 shows the most, and brighter ones the less the brighter they are.
+        good = min(size, 4) - max(0, size - self.said["overfits_from"])
+        return Render(np.full((camera.height, camera.width, 3), 1 - 0.175 * good, np.float32), alpha)
+
+    def particles(self) -> Particles | None:
+        return None
+
+    def save(self, directory: Path) -> None:
+        (directory / "model.json").write_text(json.dumps(self.said))
+        (directory / "weight.bin").write_bytes(bytes(1000 * self.said["size"]))

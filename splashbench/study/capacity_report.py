@@ -1,0 +1,247 @@
+"""What a capacity study found, as files: capacity.md and a chart for people, capacity.csv for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite, log2
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from splashbench.files import files_together, write_text
+from splashbench.harness.contract import Method
+from splashbench.markdown import bullets, one_line
+from splashbench.markdown import table as markdown_table
+from splashbench.score.metrics import METRICS
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, NO_FIGURE, in_shown_unit, shown, shown_with_spread
+from splashbench.study.capacity import CapacityPlan, capacity_frame, curves, rungs_of
+from splashbench.study.capacity_chart import draw_capacity
+from splashbench.study.job import Store
+from splashbench.study.knee import LEAST_BEND, PRICE, SAME, Knee, Rung, climbed, find_knee
+from splashbench.study.report import frame_csv
+from splashbench.study.table import NOT_RUN
+from splashbench.study.table_markdown import scenes_and_machines
+
+_STILL_RISING = "no knee: still rising"
+#: What lies beyond a knee, for people.
+_MEANING = {
+    "overfitting": "overfitting",
+    "worse": "test views get worse",
+    "too dear": "gains below their price",
+    "plateau": "a plateau",
+}
+
+
+def find_knees(capacity: CapacityPlan, store: Store) -> dict[str, Knee]:
+    """By scene, and of the mean where there are several: the knee, from the runs that are there."""
+    found = curves(capacity_frame(capacity, store))
+    return {name: find_knee(rungs_of(curve)) for name, curve in found.items()}
+
+
+def write_capacity_report(capacity: CapacityPlan, store: Store, out: Path, command: str) -> list[Path]:
+    """Write capacity.md, capacity.csv, capacity.png and .svg into `out`, all or none; returns their paths."""
+    frame = capacity_frame(capacity, store)
+    by_name = curves(frame)
+    knees = {name: find_knee(rungs_of(curve)) for name, curve in by_name.items()}
+    failures = _failures(frame)
+    with files_together(out) as staging:
+        write_text(staging / "capacity.csv", frame_csv(frame))
+        title = f"{_method(capacity)}: {_headline(by_name, knees)}"
+        charts = draw_capacity(title, frame, by_name, knees, failures, staging)
+        write_text(staging / "capacity.md", _markdown(capacity, store, title, frame, by_name, knees, failures, command))
+    return [Path(out, name) for name in ["capacity.md", "capacity.csv", *(path.name for path in charts)]]
+
+
+def knee_text(capacity: CapacityPlan, knee: Knee) -> str:
+    """One line for people: the knee and what lies beyond it."""
+    if knee.last is None:
+        return "no rung has figures"
+    if knee.rung is None:
+        if not knee.rising:
+            return f"no knee: rung {knee.last} alone has figures"
+        return f"{_STILL_RISING} at rung {knee.last}{_unclimbed(capacity, knee)}"
+    found = f"knee at rung {knee.rung} ({capacity.ladder.text(knee.rung)}); beyond it {_beyond(knee)}"
+    return found + _unclimbed(capacity, knee)
+
+
+def _unclimbed(capacity: CapacityPlan, knee: Knee) -> str:
+    above = capacity.ladder.height - (knee.last or 0)
+    return f"; {above} larger rung{'s have' if above > 1 else ' has'} no figures" if above else ""
+
+
+def _beyond(knee: Knee) -> str:
+    test = f"test views {knee.test_change:+.2f} dB"
+    train = f", training views {knee.train_change:+.2f} dB" if isfinite(knee.train_change) else ""
+    meaning = _MEANING[str(knee.beyond)]
+    if knee.beyond == "worse":
+        meaning += ", and no overfitting: training views do not gain" if train else "; no figures of training views"
+    return f"{meaning} ({test}{train} up to rung {knee.last})"
+
+
+def _method(capacity: CapacityPlan) -> str:
+    plan = capacity.plan
+    return f"{plan.method.id}, preset {plan.preset}"
+
+
+def _headline(by_name: Mapping[str, pd.DataFrame], knees: Mapping[str, Knee]) -> str:
+    """The finding of the last curve: the mean, or the one scene."""
+    name, knee = list(knees.items())[-1]
+    if knee.last is None:
+        return "no rung has figures"
+    if knee.rung is None:
+        if not knee.rising:
+            return f"rung {knee.last} alone has figures"
+        return f"no knee, still rising at rung {knee.last} of {len(by_name[name])}"
+    curve = by_name[name]
+    row = curve.loc[knee.rung]
+    return (
+        f"knee at rung {knee.rung} of {len(curve)}, {row['psnr']:.2f} dB with "
+        f"{in_shown_unit(METRICS['storage_bytes'], row['storage_bytes']):.3g} MB in {row['fit_seconds']:.3g} s; "
+        f"beyond it {_MEANING[str(knee.beyond)]}"
+    )
+
+
+def _markdown(
+    capacity: CapacityPlan,
+    store: Store,
+    title: str,
+    frame: pd.DataFrame,
+    by_name: Mapping[str, pd.DataFrame],
+    knees: Mapping[str, Knee],
+    failures: list[str],
+    command: str,
+) -> str:
+    mixed = capacity.plan.method.mixed
+    parts = [
+        f"# Capacity of {one_line(title)}",
+        "Generated by `splashbench study capacity`; not to be edited.",
+        f"```\n{command}\n```",
+        "![Quality over size, time and primitives](capacity.png)",
+        "## Knees",
+        _knees(capacity, by_name, knees),
+        bullets(f"{one_line(name)}: {one_line(knee_text(capacity, knee))}." for name, knee in knees.items()),
+        _definitions(),
+    ]
+    for name, curve in by_name.items():
+        parts += [f"## Rungs: {one_line(name)}", _rungs(capacity, curve, mixed)]
+    parts += [FILTER_NOTE] if mixed else []
+    parts += ["## Failed runs", bullets(map(one_line, failures))] if failures else []
+    return "\n\n".join([*parts, "## Conditions", _conditions(capacity, store, frame)]) + "\n"
+
+
+def _knees(capacity: CapacityPlan, by_name: Mapping[str, pd.DataFrame], knees: Mapping[str, Knee]) -> str:
+    rows = []
+    for name, knee in knees.items():
+        row = by_name[name].loc[knee.rung] if knee.rung is not None else None
+        none = _STILL_RISING if knee.rising else "no knee"
+        rows.append(
+            {
+                "scene": name,
+                "knee by price": none if knee.rung is None else f"rung {knee.rung}",
+                "bend over size": _rung(knee.bend_bytes),
+                "bend over time": _rung(knee.bend_seconds),
+                "PSNR (dB)": NO_FIGURE if row is None else shown(METRICS["psnr"], row["psnr"]),
+                "size (MB)": NO_FIGURE if row is None else shown(METRICS["storage_bytes"], row["storage_bytes"]),
+                "fit (s)": NO_FIGURE if row is None else f"{row['fit_seconds']:.3g}",
+                "beyond": knee.beyond or NO_FIGURE,
+            }
+        )
+    columns = {title: [row[title] for row in rows] for title in rows[0]}
+    return markdown_table(columns, right=("PSNR (dB)", "size (MB)", "fit (s)"))
+
+
+def _rung(number: int | None) -> str:
+    return NO_FIGURE if number is None else f"rung {number}"
+
+
+def _definitions() -> str:
+    return bullets(
+        [
+            f"Price: the last rung that gains more than {PRICE:g} dB for each doubling of seconds, and as much for "
+            "each of bytes, since the last rung that did. Where the last rung still pays there is no knee.",
+            "Bend: the rung farthest above the diagonal of PSNR over log2 cost, both scaled to [0, 1] (Kneedle, "
+            f"Satopaa et al. 2011); none below {LEAST_BEND:g}, and none where cost falls from a rung to the next.",
+            f"Beyond the knee, up to the last rung: overfitting is test views that fall by more than {SAME:g} dB while "
+            f"training views rise by more than {SAME:g} dB.",
+            "Gap is training less test PSNR. The views differ, so that its growth counts and not its size.",
+        ]
+    )
+
+
+def _rungs(capacity: CapacityPlan, curve: pd.DataFrame, mixed: bool) -> str:
+    net = _net_gains(rungs_of(curve))
+    cells: list[dict[str, str]] = []
+    for number, row in curve.iterrows():
+        rung = int(str(number))
+        figures = {
+            "size (MB)": shown(METRICS["storage_bytes"], row["storage_bytes"]),
+            "dynamic (MB)": shown(METRICS["dynamic_bytes"], row["dynamic_bytes"]),
+            "fit (s)": f"{row['fit_seconds']:.3g}" if isfinite(row["fit_seconds"]) else NO_FIGURE,
+            "memory (MiB)": shown(METRICS["peak_memory_bytes"], row["peak_memory_bytes"]),
+            "primitives": shown(METRICS["primitives_per_frame"], row["primitives_per_frame"]),
+            "PSNR": shown_with_spread(METRICS["psnr"], row["psnr"], row["psnr_std"]),
+            "of training": shown(METRICS["psnr"], row["train_psnr"]),
+            "gap": shown(METRICS["psnr"], row["train_psnr"] - row["psnr"]),
+            "net gain": net.get(rung, NO_FIGURE),
+            "LPIPS": shown(METRICS["lpips"], row["lpips"]),
+            f"mIoU{FILTER_MARK if mixed else ''}": shown(METRICS["miou"], row["miou"]),
+        }
+        runs = f"{row['ok']:.0f} of {row['runs']:.0f}"
+        cells.append({"rung": str(rung), "settings": capacity.ladder.text(rung), "runs ok": runs} | figures)
+    columns = {title: [cell[title] for cell in cells] for title in cells[0]}
+    return markdown_table(columns, right=[title for title in columns if title != "settings"])
+
+
+def _net_gains(rungs: list[Rung]) -> dict[int, str]:
+    """By rung: the dB that it gains on the last rung climbed before it, and the price of its costs."""
+    curve = [rung for rung in rungs if rung.usable]
+    found = {}
+    for place in range(1, len(curve)):
+        rung, before = curve[place], climbed(curve[:place])
+        price = PRICE * (log2(rung.seconds / before.seconds) + log2(rung.bytes / before.bytes))
+        found[rung.number] = f"{rung.test - before.test:+.2f} for {price:.2f}"
+    return found
+
+
+def _failures(frame: pd.DataFrame) -> list[str]:
+    """A line for each run that failed, and each whose training views could not be rendered."""
+    lines = []
+    for row in frame.to_dict("records"):
+        where = f"rung {row['rung']}, {row['scene']}, seed {row['seed']}"
+        if row["status"] not in ("ok", NOT_RUN):
+            lines.append(f"{where}: {row['status']}: {row['reason']}".rstrip(": "))
+        elif row["train_status"] not in ("ok", ""):
+            lines.append(f"{where}, training views: {row['train_status']}: {row['train_reason']}".rstrip(": "))
+    return lines
+
+
+def _conditions(capacity: CapacityPlan, store: Store, frame: pd.DataFrame) -> str:
+    plan = capacity.plan
+    method: Method = plan.method
+    entries = [entry for run in plan.runs if (entry := store.entry(run.digest)) is not None]
+    results = [result for entry in entries if (result := store.result(entry)) is not None]
+    counts = frame["status"].value_counts()
+    waiting = int(counts.get(NOT_RUN, 0))
+    base = ", ".join(f"{key} = {value}" for key, value in plan.spec.base.items())
+    views: dict[str, Any] = {
+        run.scene.name: entry.training.views
+        for run in plan.runs
+        if (entry := store.entry(run.digest)) and entry.training
+    }
+    lines = [
+        f"{method.id}: version {method.version}, preset {plan.preset}" + (f", {base}" if base else ""),
+        f"Seeds: {', '.join(map(str, plan.spec.seeds))}",
+        f"Runs: {int(counts.get('ok', 0))} ok, {len(frame) - int(counts.get('ok', 0)) - waiting} failed"
+        + (f", {waiting} not run yet" if waiting else ""),
+        *(
+            f"Training views of {scene}: "
+            + ", ".join(f"{camera} at {len(steps)} timesteps" for camera, steps in of_scene.items())
+            for scene, of_scene in views.items()
+        ),
+    ]
+    if frame["psnr"].notna().any() and frame["lpips"].isna().all():
+        lines.append("No LPIPS, since there are no weights: give --lpips-weights")
+    at_once = max((entry.at_once for entry in entries), default=1)
+    lines += [f"{at_once} runs at once: fit times compare poorly"] if at_once > 1 else []
+    return bullets(map(one_line, lines)) + "\n" + scenes_and_machines(plan.scenes, results)
