@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splashbench.background.clean_plate import MAX_FRAMES, CleanPlate, make_clean_plate, make_clean_plates
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_npz, write_npz
+from splashbench.files import compressed_bytes, read_npz, write_npz
 from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench.gaussians.initialization import hull_points
 from splashbench.gaussians.torch_threads import one_torch_thread
@@ -70,8 +70,17 @@ class Background:
 
     def save(self, directory: Path) -> None:
         """Write background.npz into `directory` (made where absent)."""
+        write_npz(Path(directory) / _FILE, self._arrays)
+
+    @property
+    def stored_bytes(self) -> int:
+        """How much `save` writes, to within some kilobytes."""
+        return compressed_bytes(self._arrays)
+
+    @property
+    def _arrays(self) -> dict[str, np.ndarray]:
         variant = {name: np.array(value) for name, value in vars(self.model.variant).items()}
-        write_npz(Path(directory) / _FILE, {"far_color": self.far_color, **variant, **to_arrays(self.model)})
+        return {"far_color": self.far_color, **variant, **to_arrays(self.model)}
 
     @classmethod
     def load(cls, directory: Path) -> Background:

@@ -20,6 +20,7 @@ from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
 from splashbench.selfcalibration import self_calibration
 
+from .affordable import background_update, within_bytes, within_seconds
 from .appearance.decoder import Children
 from .appearance.fitting import composite
 from .carriers.between import carriers_at
@@ -29,7 +30,7 @@ from .fields.container import known_container
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import metric_gravity
 from .model import Liquid
-from .reconstruction import Reconstruction, fit_liquid, trace_liquid
+from .reconstruction import Reconstruction, Traced, fit_liquid, trace_liquid
 from .settings import VERSION, SplashSplatConfig
 
 if TYPE_CHECKING:
@@ -139,6 +140,7 @@ class SplashSplat(Method):
     id: ClassVar[str] = "splashsplat"
     title: ClassVar[str] = "SplashSplat"
     version: ClassVar[str] = VERSION
+    budgets: ClassVar[tuple[str, ...]] = ("seconds", "storage_bytes")
     Config = SplashSplatConfig
 
     def supports(self, scene: TrainingScene) -> Support:
@@ -160,7 +162,7 @@ class SplashSplat(Method):
 
         def fit_background(part: Run) -> Background:
             with part.stage("background"), one_torch_thread():
-                return shared_background(scene, config.background, part)
+                return shared_background(scene, settings, part)
 
         plates = cache(lambda: clean_plates(scene))
         known, drafted = None, None
@@ -193,9 +195,13 @@ class SplashSplat(Method):
                 behind = completed(plates(), background)
             # What is shown on the way; the liquid is fitted before the plates, whether there was a draft or not.
             background = drafted or background
-        late, traced = run.ahead(
-            fit_background, lambda part: trace_liquid(scene, config, part, known), span=(0, _BEFORE)
-        )
+        spent = within_seconds(scene, config, run)
+        config, settings = spent.config, config.background.model_copy(update=background_update(config, run))
+
+        def trace(part: Run) -> Traced:
+            return within_bytes(config, part, lambda coarser: trace_liquid(scene, coarser, part, known), spent.traced)
+
+        late, traced = run.ahead(fit_background, trace, span=(0, _BEFORE))
         if config.composition == "together":
             background = late()
             behind = dict.fromkeys(scene.train, background.far_color)
@@ -220,7 +226,14 @@ class SplashSplat(Method):
         ) -> tuple[Liquid, Background, LiquidOcclusion | None]:
             return liquid, background, occlusion
 
-        found = fit_liquid(scene, behind, traced, run, (_BEFORE, 1), frozen, offer, settled)
+        room = None
+        if run.budget.storage_bytes is not None:
+            limit = run.budget.storage_bytes
+
+            def room() -> int:
+                return limit - background.stored_bytes
+
+        found = fit_liquid(scene, behind, traced, run, (_BEFORE, 1), frozen, offer, settled, room)
         if settled is not None:
             background = late()  # a fit without any photograph asked for none
         return FittedSplashSplat(*with_background(*found))

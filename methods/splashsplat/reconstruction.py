@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splashbench.files import compressed_bytes
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.native import memory
@@ -24,6 +25,7 @@ from .appearance.first_look import photographed, take_on
 from .appearance.fitting import Appearance, Fit, fit_appearance, initial_appearance, visible_carriers
 from .appearance.glass import glass_before
 from .appearance.iterations import iterations_decision
+from .appearance.schedule import Clock
 from .appearance.sensitivity import Sensitivity
 from .appearance.targets import collect_targets, set_backgrounds
 from .carriers.coverage import uncovered_by_any
@@ -40,13 +42,17 @@ from .motion.steps import FrameStep, Motion
 from .motion.velocity import control_shape
 from .settings import SplashSplatConfig
 from .storage.signed_distance import reach
-from .storage.steps import storage_step
-from .storage.track import stored_track
+from .storage.steps import Storage
+from .storage.track import carrier_arrays, stored_track, track_arrays
 
 Report = Callable[[float, str], None]
 #: The liquid, and what hides it from cameras.
 Reconstruction = tuple[Liquid, LiquidOcclusion | None]
 
+# Share of the seconds left for the appearance that storing it takes, and seconds beside.
+_STORING, _STORING_LEAST = 0.03, 1.0
+# Bytes of liquid.json and of the decoder's heads, roundly.
+_HEADER = 12_000
 # A carrier is seen through at most this many shells of liquid.
 _SEEN_THROUGH = 1.5
 # Pixels along the longer side of the images for which the setting `glass` is meant.
@@ -61,6 +67,20 @@ class Traced:
     observations: Observations
     track: Track
     config: SplashSplatConfig
+
+    @property
+    def track_bytes(self) -> int:
+        """How much of the files the track takes."""
+        arrays = track_arrays(self.track, self.config.carried)
+        return sum(compressed_bytes(file) for file in arrays.values())
+
+
+def _clock(run: Run) -> Clock | None:
+    """When the appearance has to be done, by the run's budget: storing takes a share of what is left for it."""
+    if run.budget.seconds is None:
+        return None
+    left = max(run.budget.seconds - run.seconds, 0.0)
+    return Clock(lambda: run.seconds, run.budget.seconds - min(_STORING * left + _STORING_LEAST, 0.5 * left))
 
 
 def trace_liquid(
@@ -86,6 +106,7 @@ def fit_liquid(
     frozen: Mapping[str, Frozen] | None = None,
     offer: Callable[[Callable[[], Reconstruction], bool], None] | None = None,
     settled: Callable[[], dict[str, np.ndarray]] | None = None,
+    room: Callable[[], int] | None = None,
 ) -> Reconstruction:
     """Fit the appearance of the liquid of `scene`; returns it, and what hides it from cameras.
 
@@ -94,6 +115,7 @@ def fit_liquid(
     part of `run`'s progress this takes up. offer: is given, after iterations of the appearance, what makes the
     reconstruction as if the fit ended there, and whether there will be no other for a while. settled: where given,
     `backgrounds` are for the first iterations (`plates_share`), and this gives those for the others.
+    room: where given, the bytes that the liquid may take, asked for at the end.
     """
     config, observations, track = traced.config, traced.observations, traced.track
     occlusion = observations.occlusion
@@ -133,6 +155,7 @@ def fit_liquid(
             lambda done: run.progress(span[0] + (span[1] - span[0]) * done, "appearance"),
             offer_state,
             settled,
+            _clock(run),
         )
     if fit is not None and fit.earned:
         run.decide(iterations_decision(fit.earned, len(fit.losses)))
@@ -142,9 +165,26 @@ def fit_liquid(
     if fit.sensitivity is None:
         return reconstruction(appearance, left)
     with run.stage("storing"), one_torch_thread():
-        step, decision = storage_step(appearance, left, fit, config.storage_tolerance, run.seed)
+        storage = Storage(appearance, left, fit, run.seed)
+        stored, decision = storage.within_tolerance(config.storage_tolerance)
         run.decide(decision)
-        return reconstruction(appearance, left, fit.sensitivity, step)
+        if room is not None:
+            arrays = track_arrays(track, config.carried)
+            fixed = _HEADER + sum(compressed_bytes(arrays[name]) for name in ("motion", "distance"))
+
+            def other_bytes(kept: np.ndarray) -> int:
+                return fixed + compressed_bytes(carrier_arrays(track, track.carriers.keep(kept)[0], config.carried))
+
+            stored, spent = storage.within_room(room() - _glass_bytes(appearance), stored, other_bytes)
+            if spent is not None:
+                run.decide(spent)
+        return reconstruction(appearance, stored.kept, fit.sensitivity, stored.step)
+
+
+def _glass_bytes(appearance: Appearance) -> int:
+    """How much of the files glass takes, at the most."""
+    tables = {} if appearance.glass is None else appearance.glass.tables
+    return sum(2 * table.numel() for table in tables.values())
 
 
 def _track(
@@ -237,6 +277,7 @@ def _fit_appearance(
     progress: Callable[[float], None],
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None],
     settled: Callable[[], dict[str, np.ndarray]] | None,
+    clock: Clock | None,
 ) -> tuple[Appearance, Fit | None]:
     """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; None where there
     are none."""
@@ -281,7 +322,9 @@ def _fit_appearance(
             set_smaller_backgrounds(targets, behind)
             backgrounds.clear()  # nobody needs those of before, which are large
 
-    fit = fit_appearance(appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle)
+    fit = fit_appearance(
+        appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle, clock
+    )
     return appearance, fit
 
 

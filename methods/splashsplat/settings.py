@@ -53,6 +53,9 @@ class SplashSplatConfig(MethodConfig):
     voxel_pixels: float = Field(0.6, ge=0, le=16)
     #: the same in a transparent container, whose liquid is seen through its sides
     clear_voxel_pixels: float = Field(0.8, ge=0, le=16)
+    #: edge of a hull voxel by the smallest length that the scene's cameras can show, as measured before the fit, in
+    #: place of `voxel_pixels` and `clear_voxel_pixels`
+    observable: bool = False
     #: hull cells along the longest side that `voxel_pixels` and `clear_voxel_pixels` leave at least
     fewest_cells: int = Field(128, ge=16, le=512)
     transport_cells: int = Field(150, ge=16, le=256)
@@ -217,7 +220,8 @@ class SplashSplatConfig(MethodConfig):
         "iterations": (500, 1000, 2000, 4000, 8000),
     }
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "best": {},
+        "best": {"storage_tolerance": 0.01},
+        "auto": {"observable": True, "validation_share": 0.04, "price": 0.1},
         "paper": {
             "hull_cells": 176,
             "transport_cells": 96,
@@ -335,6 +339,7 @@ class SplashSplatConfig(MethodConfig):
             ballistic=self.ballistic,
             tight_bounds=self.tight_bounds,
             repeats=self.repeats,
+            observable=self.observable,
         )
 
     @property
@@ -372,6 +377,7 @@ class SplashSplatConfig(MethodConfig):
                 "clear_voxel_pixels": _DRAFT_PIXELS,
                 "fewest_cells": _DRAFT_FEWEST,
                 "control_cells": 4,
+                "observable": False,
                 "detect_failed_masks": False,
                 "tight_bounds": False,
                 "cut_at_rim": False,

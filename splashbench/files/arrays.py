@@ -78,7 +78,7 @@ def read_npz(
                 raise SplashbenchError(f"{path} unpacks to more than {limit / 2**30:.3g} GiB; refused")
             unknown = [entry.filename for entry in entries if entry.compress_type not in _COMPRESSIONS]
             if unknown:
-                raise SplashbenchError(f"{path}: {unknown[0]!r} is not deflated or bzipped; write it again")
+                raise NotImplementedError(f"{unknown[0]!r} is neither deflated nor bzipped")
             for entry in entries:
                 with archive.open(entry) as stream:
                     _require_its_size(stream, entry)

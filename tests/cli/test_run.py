@@ -11,6 +11,7 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.harness.checkpoints import MARKS
 from splashbench.harness.runner import TIMING_FRAMES
+from splashbench.submission import Budget
 
 COMMON: list[Any] = ["--seed", 3, "--device", "cuda", "--timeout", 60, "--exr", "--no-model", "--replace"]
 COMMON_KEYWORDS = {
@@ -46,14 +47,14 @@ def test_options_of_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert arguments == ("nothing", Path("SCENE"), Path("OUT"))
     assert keywords.pop("oracle_geometry")
     none = {"preset": None, "overrides": {}, "timing_frames": TIMING_FRAMES, "withheld": None}
-    none["checkpoints"] = None
+    none["checkpoints"], none["budget"] = None, None
     assert keywords == DEFAULTS | none
     words = ["--preset", "quick", "--set", "a.b=1", "--set", "c=x", "--withhold", "odd", "--timing-frames", 0]
-    words.append("--checkpoints")
+    words += ["--checkpoints", "--budget-seconds", 60, "--budget-mb", 1.5]
     _, keywords = _handed_on(monkeypatch, function, ["run", "nothing", "SCENE", "OUT", *COMMON, *words])
     del keywords["oracle_geometry"]
     own = {"preset": "quick", "overrides": {"a": {"b": 1}, "c": "x"}, "timing_frames": 0, "withheld": "odd"}
-    own["checkpoints"] = MARKS
+    own["checkpoints"], own["budget"] = MARKS, Budget(seconds=60, storage_bytes=1_500_000)
     assert keywords == COMMON_KEYWORDS | own
 
 

@@ -7,7 +7,8 @@ background and descends on the seven losses. Positions and deformations are give
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -24,12 +25,23 @@ from ..carriers.subframe import Track
 from ..kernel.window_loss import WindowPhotograph, window_losses
 from . import losses
 from .active import Active, ActiveCarriers
+from .averages import Averages
 from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .glass import Glass, GlassFit, Splats
 from .optimizer import RowAdam
 from .photographs import ReadAhead, read_now
-from .schedule import AdaptiveSchedule, Earned, EarningSchedule, FixedSchedule, Schedule, WithheldLook, withheld
+from .schedule import (
+    AdaptiveSchedule,
+    Clock,
+    Earned,
+    EarningSchedule,
+    FixedSchedule,
+    Schedule,
+    TimedSchedule,
+    WithheldLook,
+    withheld,
+)
 from .sensitivity import Sensitivities, Sensitivity
 from .shared_features import SharedFeatures
 from .targets import TrainingTarget
@@ -105,19 +117,39 @@ class Appearance:
     glass: Glass | None = None
 
 
+#: Given the number of a target, features and log-scales of all carriers, and by how much the opacity of each is
+#: multiplied (float32 [count], None for 1): the window as these would show it, and its photograph.
+Drawn = Callable[[int, Tensor, Tensor, Tensor | None], tuple[Tensor, WindowPhotograph]]
+
+
 @dataclass(frozen=True)
 class Fit:
     """losses: of every iteration. left: bool [count], the carriers that were fitted to the end. sensitivity: of the
-    photographs to what was learned; None where it was not asked for. drawn: given the number of a target, features and
-    log-scales of all carriers, the window as these would show it, and its photograph. photographs: how many targets.
+    photographs to what was learned; None where it was not asked for. drawn: see `Drawn`. photographs: how many targets.
     earned: what stretches of iterations bought, where that decided how many there were."""
 
     losses: list[float]
     left: np.ndarray
     sensitivity: Sensitivity | None
-    drawn: Callable[[int, Tensor, Tensor], tuple[Tensor, WindowPhotograph]]
+    drawn: Drawn
     photographs: int
     earned: tuple[Earned, ...] = ()
+
+
+class _Moments:
+    """Shares of the fit at which something is due: of `iterations`, or of what the schedule says is done."""
+
+    def __init__(self, shares: Sequence[float], iterations: int, by_schedule: bool) -> None:
+        self._iterations = {round(share * iterations) for share in shares}
+        self._left = sorted(shares) if by_schedule else None
+
+    def come(self, iteration: int, schedule: Schedule) -> bool:
+        """Whether one is due before this iteration."""
+        if self._left is None:
+            return iteration in self._iterations
+        done, before = schedule.done(iteration), len(self._left)
+        self._left = [share for share in self._left if share > done]
+        return len(self._left) < before
 
 
 def initial_appearance(
@@ -258,12 +290,14 @@ def fit_appearance(
     progress: Callable[[float], None],
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None = None,
     settle: Callable[[], None] | None = None,
+    clock: Clock | None = None,
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
 
     offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, and the
     carriers still fitted: bool [count]; and whether there will be no other for a while. settle: is called once, after
-    the share `plates_share`, to put the background behind `targets`.
+    the share `plates_share`, to put the background behind `targets`. clock: where given, the fit ends when it has run
+    out, and `iterations` are the most that there are.
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -286,12 +320,13 @@ def fit_appearance(
         seed,
     )
     rng = np.random.default_rng([seed, 1])
-    measured: Sensitivities | None = None
-    if settings.measured_share > 0:
-        measured = Sensitivities(track.carriers.count, appearance.features.shape[1] + appearance.log_scales.shape[1])
+    size = appearance.features.shape[1] + appearance.log_scales.shape[1]
+    measured = Sensitivities(track.carriers.count, size) if settings.measured_share > 0 else None
     withheld_targets = np.zeros(len(targets), dtype=bool)
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
-    if settings.validation_share > 0:
+    if clock is not None:
+        schedule = TimedSchedule(settings.iterations, clock)
+    elif settings.validation_share > 0:
         adaptive: AdaptiveSchedule | EarningSchedule = (
             EarningSchedule(settings.iterations, _LOOK_EVERY, settings.price, _BEFORE, _FALL)
             if settings.price > 0
@@ -301,6 +336,10 @@ def fit_appearance(
             withheld_targets = withheld(len(targets), settings.validation_share, np.random.default_rng([seed, 3]))
         if withheld_targets.any() or not adaptive.may_stop:
             schedule = adaptive
+
+    averages: Averages | None = None
+    if isinstance(schedule, EarningSchedule) and schedule.withholds:
+        averages = Averages(track.carriers.count, size, decoder)
 
     def shown(children: Children, target: TrainingTarget, active: Active) -> tuple[Tensor, Tensor]:
         before = None if glass is None else glass.glass.seen(target.eye)
@@ -331,7 +370,11 @@ def fit_appearance(
         for number in np.nonzero(withheld_targets)[0]:
             target = targets[number].coarse or targets[number]  # of one size at all looks
             active = carriers.of(target)
-            image, alpha, _ = seen(target, active, learned(target.frame, active), penalised=False)
+            values = learned(target.frame, active)
+            if averages is not None:
+                mean = averages.of(active.ids, torch.cat(values, dim=1))
+                values = list(mean.split([values[0].shape[1], values[1].shape[1]], dim=1))
+            image, alpha, _ = seen(target, active, [table.contiguous() for table in values], penalised=False)
             photograph = read_now(target.photograph)
             total += float(image_loss(image, alpha, photograph, target.area, weights, weights.ssim))
             quality.append(masked_psnr(image, photograph))
@@ -355,9 +398,14 @@ def fit_appearance(
         return look, carriers.left(track.carriers.count)
 
     @torch.no_grad()
-    def drawn(number: int, every_feature: Tensor, every_scale: Tensor) -> tuple[Tensor, WindowPhotograph]:
+    def drawn(
+        number: int, every_feature: Tensor, every_scale: Tensor, opacity: Tensor | None
+    ) -> tuple[Tensor, WindowPhotograph]:
         target = targets[number]
         active = carriers.of(target)
+        if opacity is not None:
+            left, before = opacity.index_select(0, active.ids), active.state.visibility
+            active = replace(active, state=replace(active.state, visibility=left if before is None else left * before))
         children, _ = decoder.decode(every_feature, every_scale, active.ids, active.state, target.eye)
         return shown(children, replace(target, modes=None), active)[0], read_now(target.photograph)
 
@@ -370,15 +418,18 @@ def fit_appearance(
         return target
 
     reader = ReadAhead()
-    prunings = {round(share * settings.iterations) for share in _PRUNINGS}
-    focusings = {round(share * settings.iterations) for share in _FOCUSINGS}
+    prunings, focusings = (
+        _Moments(shares, settings.iterations, clock is not None) for shares in (_PRUNINGS, _FOCUSINGS)
+    )
     shown_from = round(_SHOWN_FROM * len(targets))
     queue: list[int] = []
     history: list[float] = []
     iteration = 0
     while True:
         if schedule.due(iteration):
-            schedule.look(iteration, withheld_look())
+            with nullcontext() if averages is None else averages.heads():
+                look = withheld_look()
+            schedule.look(iteration, look)
         factor = schedule.factor(iteration)
         if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
             if offer is not None and iteration >= shown_from:
@@ -393,10 +444,10 @@ def fit_appearance(
         if not queue:
             fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
-        if settings.prune_opacity > 0 and iteration in prunings:
+        if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
             carriers.drop(decoder.mean_opacity(features.all()).detach() < settings.prune_opacity)
             features.keep(carriers.ids)
-        if settings.idle_share > 0 and iteration in focusings and iteration >= _SEEN_BEFORE * len(targets):
+        if settings.idle_share > 0 and focusings.come(iteration, schedule) and iteration >= _SEEN_BEFORE * len(targets):
             carriers.focus(idle, targets)
             features.keep(carriers.ids)
         target = targets[queue.pop()]
@@ -428,6 +479,8 @@ def fit_appearance(
         heads.step()
         features.step(target.frame, by_feature, factor, active.places)
         scales.step(active.ids, by_scale, factor)
+        if averages is not None and schedule.withholds:
+            averages.add(active.ids, torch.cat(learned(target.frame, active), dim=1))
         if glass is not None:
             glass.step(others[len(parameters) :], factor)
         iteration += 1

@@ -9,6 +9,7 @@ worth that it takes.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -147,6 +148,38 @@ class EarningSchedule:
     @property
     def _end(self) -> int:
         return min(self.limit, max(self._turn + 1, round((1 + self.fall) * self._turn)))
+
+
+@dataclass(frozen=True)
+class Clock:
+    """seconds: of the fit so far. end: when the appearance has to be done."""
+
+    seconds: Callable[[], float]
+    end: float
+
+
+class TimedSchedule:
+    """Down a half cosine until `clock` has run out, or `limit` iterations were made, whichever comes first."""
+
+    withholds = False
+
+    def __init__(self, limit: int, clock: Clock) -> None:
+        self.limit, self._clock = limit, clock
+        self._start = clock.seconds()
+
+    def due(self, iteration: int) -> bool:
+        return False
+
+    def look(self, iteration: int, seen: WithheldLook) -> None:
+        raise AssertionError("a schedule by the clock looks at nothing")
+
+    def factor(self, iteration: int) -> float | None:
+        done = self.done(iteration)
+        return _cosine(done) if done < 1 else None
+
+    def done(self, iteration: int) -> float:
+        whole = max(self._clock.end - self._start, 1e-6)
+        return min(max((self._clock.seconds() - self._start) / whole, iteration / max(self.limit, 1)), 1.0)
 
 
 class AdaptiveSchedule:

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from splashbench.harness.contract import Run
+from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
 from splashbench.observe.grid import Bounds
 from splashbench.observe.kernels import resample
+from splashbench.observe.observable import Observable, observable
 from splashbench.observe.occlusion import ContainerOcclusion, focal_length
 from splashbench.observe.reduced_masks import reduced
 from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
@@ -32,6 +33,9 @@ from .repeats import repeated_frames
 from .rim import rim_of
 
 Report = Callable[[float, str], None]
+
+# Edge of a hull voxel, as a share of the smallest length that the cameras can show: two samples of it and a little.
+_SHARE_OF_OBSERVABLE = 0.45
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
 _REVISION = 10
@@ -58,6 +62,7 @@ class FieldSettings:
     ballistic: bool
     tight_bounds: bool = True
     repeats: bool = True
+    observable: bool = False
 
     def key(self) -> dict[str, Any]:
         """What a stored phi_t was computed with; it is on the hull grid, whatever the transport grid."""
@@ -177,6 +182,12 @@ def observe(
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
     seen_through = container is not None and not container.hides
     voxel_pixels = settings.clear_voxel_pixels if seen_through else settings.voxel_pixels
+    if settings.observable:
+        with run.stage("observable length"):
+            found = observable(scene, silhouettes, bounds, container)
+        wanted = max(_SHARE_OF_OBSERVABLE * found.pixels, 1e-3)
+        run.decide(_grid_decision(found, wanted, scene.metres_per_unit))
+        voxel_pixels = wanted
     hull_cells, transport_cells = _cells(bounds, scene, settings, voxel_pixels)
     run.note("grid", f"{hull_cells} cells along the longest side of {bounds.longest_side:.3g}")
     hull_grid, grid = Grid.over(bounds, hull_cells), Grid.over(bounds, transport_cells)
@@ -207,6 +218,36 @@ def observe(
             "repeated frames", f"{int(repeated.sum())} of {len(repeated)} timesteps show what the one before shows"
         )
     return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues, repeated)
+
+
+def _grid_decision(found: Observable, wanted: float, metres: float | None) -> Decision:
+    """What the smallest length that the cameras can show is made of, and the hull's voxels that follow from it."""
+
+    def length(pixels: float) -> str:
+        size = pixels * found.pixel
+        unit = f"{1000 * metres * size:.2f} mm" if metres is not None else f"{size:.3g} scene units"
+        return f"{pixels:.2f} px, {unit}"
+
+    edge = "is not told by the photographs" if found.edge is None else f"is {found.edge:.2f} px wide"
+    terms = {
+        "pixel": (1.0, "what a pixel spans at the liquid"),
+        "edge": (found.edge or 0.0, f"the liquid's edge in the photographs {edge}"),
+        "disagreement": (found.disagreement, "width of the rim of masks that the other views do not allow"),
+        "all together": (
+            found.pixels,
+            f"{found.angle:.0f} degrees between the views that differ most",
+        ),
+    }
+    return Decision(
+        name="hull voxel",
+        basis="scene",
+        chosen=length(wanted),
+        because=f"{_SHARE_OF_OBSERVABLE:g} of the smallest length that the cameras can show",
+        rungs=[
+            Rung(value=f"{name}: {length(pixels)}", bought=name == "all together", reason=reason)
+            for name, (pixels, reason) in terms.items()
+        ],
+    )
 
 
 def _cells(bounds: Bounds, scene: TrainingScene, settings: FieldSettings, voxel_pixels: float) -> tuple[int, int]:

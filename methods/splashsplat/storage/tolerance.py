@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..kernel.window_loss import WindowPhotograph
+from ..appearance.fitting import Drawn
 
 # Trials at most, once one is within the tolerance.
 _TRIALS = 6
@@ -39,7 +39,7 @@ class Loss:
 
     def __init__(
         self,
-        drawn: Callable[[int, Tensor, Tensor], tuple[Tensor, WindowPhotograph]],
+        drawn: Drawn,
         numbers: Sequence[int],
         exact: tuple[Tensor, Tensor],
     ) -> None:
@@ -48,17 +48,18 @@ class Loss:
         self._without = sum(float((image - truth).square().sum()) for image, truth in self._exact.values())
         self._count = sum(image.numel() for image, _ in self._exact.values())
 
-    def _inside(self, number: int, values: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    def _inside(self, number: int, values: tuple[Tensor, Tensor], shown: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Render and photograph within the mask, [n, 3] each."""
-        image, photograph = self._drawn(number, *values)
+        image, photograph = self._drawn(number, *values, shown)
         truth = photograph.image[photograph.mask].to(torch.float32) / 255
         return image[photograph.box][photograph.mask].clamp(0, 1), truth
 
-    def of(self, step: float, values: tuple[Tensor, Tensor]) -> Trial:
-        """What is lost with `values`, which were stored with `step`."""
+    def of(self, step: float, values: tuple[Tensor, Tensor], shown: Tensor | None = None) -> Trial:
+        """What is lost with `values`, which were stored with `step`. shown: float32 [count], 0 for carriers that are
+        left out; None for all."""
         other, error = 0.0, 0.0
         for number, (image, truth) in self._exact.items():
-            stored, _ = self._inside(number, values)
+            stored, _ = self._inside(number, values, shown)
             other += float((stored - image).square().sum())
             error += float((stored - truth).square().sum())
         return Trial(step, other / max(self._without, 1e-12), self._decibels(error), self._decibels(other))

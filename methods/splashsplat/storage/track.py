@@ -9,6 +9,7 @@ import numpy as np
 
 from splashbench.observe.grid import Grid
 
+from ..carriers.population import Carriers
 from ..carriers.subframe import Track
 from ..motion.fall import falls_of, table_of
 from ..motion.steps import Motion
@@ -39,15 +40,21 @@ def stored_track(track: Track, times: np.ndarray, carried: bool, distance_steps:
 def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]]:
     """What is stored of a track, by file. Of one that `stored_track` gave, this loses nothing."""
     control = whole_velocities(track.motion.velocities)
-    rows = dict(vars(store_rows(track.carriers, control, track.motion, track.grid)))
-    if not carried:
-        rows["deformation"] = track.carriers.deformation.astype(np.float16)
     jets, turn = table_of(track.motion.falls)
     return {
-        "carriers": rows,
+        "carriers": carrier_arrays(track, track.carriers, carried),
         "motion": {"velocities": control, "jets": jets, "turn": turn},
         "distance": {"phi": store_distance(track.phi)},
     }
+
+
+def carrier_arrays(track: Track, carriers: Carriers, carried: bool) -> dict[str, np.ndarray]:
+    """What is stored of `carriers`, those of `track` or some of them."""
+    control = whole_velocities(track.motion.velocities)
+    rows = dict(vars(store_rows(carriers, control, track.motion, track.grid)))
+    if not carried:
+        rows["deformation"] = carriers.deformation.astype(np.float16)
+    return rows
 
 
 def read_track(arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times: np.ndarray, factor: Factor) -> Track:

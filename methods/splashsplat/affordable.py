@@ -1,0 +1,158 @@
+"""What of the method a budget of seconds or bytes leaves room for: grids before the fit, and a clock for the fit.
+
+How long a reconstruction on a finer grid takes is told from how long a coarse one took on the same scene and machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from splashbench.harness.contract import Decision, Run, Rung
+from splashbench.scene.scene import TrainingScene
+
+from .reconstruction import Traced, trace_liquid
+from .settings import SplashSplatConfig
+
+# Hull cells along the longest side that may be chosen.
+_CELLS = (128, 160, 200, 240, 300)
+# By how much longer a trace takes than the draft's, at as many cells; and how that grows with cells along a side.
+# Measured on opaque_bowl and glass_tank, whose exponents were 2.0 and 2.3.
+_LONGER, _EXPONENT = 1.35, 2.15
+# Share of the seconds that what comes before the appearance may take.
+_BEFORE = 0.4
+# Below so many seconds there is the draft's background, below so many `quick`'s.
+_DRAFT_BACKGROUND, _QUICK_BACKGROUND = 45.0, 120.0
+# Bytes of a background anchor as it is stored, and the share of a byte budget for all of them.
+_ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25
+# Bytes of a carrier's values, about; a track that takes more than this much of its room is traced anew, coarser.
+_VALUE_BYTES, _TOO_LARGE = 4.5, 1.5
+# Traces of one scene, and cells along a side, at the least.
+_TRACES, _FEWEST = 4, 32
+
+
+@dataclass(frozen=True)
+class Affordable:
+    """config: what the budget allows. traced: where it was traced on the way."""
+
+    config: SplashSplatConfig
+    traced: Traced | None = None
+
+
+def within_seconds(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> Affordable:
+    """The finest grids whose trace leaves most of `run.budget.seconds` to the appearance; `config` without a budget.
+
+    The draft's trace is made to tell how long others take, and taken where no other is affordable.
+    """
+    seconds = run.budget.seconds
+    if seconds is None:
+        return Affordable(config)
+    start = run.seconds
+    draft = config.draft()
+    traced = trace_liquid(scene, draft, run)
+    took = max(run.seconds - start, 1e-3)
+    cells = max(traced.observations.hull_grid.shape) - 1
+    left = seconds - run.seconds
+    full = _cells_of(traced, config)
+    options = sorted({min(option, full) for option in _CELLS})
+    predicted = {option: _LONGER * took * (option / cells) ** _EXPONENT for option in options}
+    chosen = max((option for option in options if predicted[option] <= _BEFORE * left), default=None)
+    rungs = [Rung(value=f"draft, {cells} cells", bought=chosen is None, seconds=took)]
+    rungs += [
+        Rung(value=f"{option} cells", bought=option == chosen, seconds=predicted[option] - took) for option in options
+    ]
+    run.decide(
+        Decision(
+            name="grids for the seconds",
+            basis="budget",
+            chosen=f"{cells} cells, as the draft" if chosen is None else f"{chosen} cells",
+            because=f"a trace may take {100 * _BEFORE:.0f} % of what is left of {seconds:g} s, and the draft's took "
+            f"{took:.1f} s",
+            rungs=rungs,
+        )
+    )
+    if chosen is None:
+        return Affordable(draft.model_copy(update={"iterations": config.iterations}), traced)
+    return Affordable(with_cells(config, chosen))
+
+
+def _cells_of(traced: Traced, config: SplashSplatConfig) -> int:
+    """Hull cells along the longest side that `config` has on a scene whose draft was `traced`."""
+    cells = max(traced.observations.hull_grid.shape) - 1
+    # The draft's voxels span `draft` pixels, unless that were too few of them.
+    draft = config.draft()
+    if config.voxel_pixels == 0 or cells >= draft.hull_cells or cells <= draft.fewest_cells:
+        return config.hull_cells
+    return min(config.hull_cells, max(config.fewest_cells, round(cells * draft.voxel_pixels / config.voxel_pixels)))
+
+
+def with_cells(config: SplashSplatConfig, hull_cells: int) -> SplashSplatConfig:
+    """`config` on grids of at most `hull_cells` along the longest side, the others in proportion."""
+    share = hull_cells / config.hull_cells
+    if share >= 1:
+        return config
+    return config.model_copy(
+        update={
+            "hull_cells": hull_cells,
+            "transport_cells": max(16, round(share * config.transport_cells)),
+            "control_cells": max(4, round(share * config.control_cells)),
+            "fewest_cells": max(16, min(config.fewest_cells, hull_cells)),
+        }
+    )
+
+
+def within_bytes(
+    config: SplashSplatConfig, run: Run, trace: Callable[[SplashSplatConfig], Traced], first: Traced | None = None
+) -> Traced:
+    """What `trace` gives for `config`, or on coarser grids where that could not be stored within the run's budget.
+
+    first: what it gave for `config` already.
+    """
+    traced = first or trace(config)
+    limit = run.budget.storage_bytes
+    if limit is None:
+        return traced
+    room = (1 - _BACKGROUND_SHARE) * limit
+    rungs = []
+    for _ in range(_TRACES):
+        cells = max(traced.observations.hull_grid.shape) - 1
+        size = stored_estimate(traced)
+        fits = size <= _TOO_LARGE * room
+        rungs.append(Rung(value=f"{cells} cells", bought=fits, bytes=size))
+        if fits or cells <= _FEWEST:
+            break
+        config = with_cells(config, max(_FEWEST, round(cells * (room / size) ** 0.5)))
+        traced = trace(config)
+    if len(rungs) > 1:
+        cells = max(traced.observations.hull_grid.shape) - 1
+        run.decide(
+            Decision(
+                name="grids for the bytes",
+                basis="budget",
+                chosen=f"{cells} cells",
+                because=f"{room / 1e6:.2f} MB are left beside the background",
+                rungs=rungs,
+            )
+        )
+    return traced
+
+
+def stored_estimate(traced: Traced) -> float:
+    """Bytes that the liquid will take, about: half of the carriers are pruned by the fit."""
+    return traced.track_bytes + 0.5 * _VALUE_BYTES * traced.track.carriers.count
+
+
+def background_update(config: SplashSplatConfig, run: Run) -> dict[str, int]:
+    """Settings of the background that the run's budget asks for."""
+    update = {}
+    if run.budget.storage_bytes is not None:
+        most = max(100, int(_BACKGROUND_SHARE * run.budget.storage_bytes / _ANCHOR_BYTES))
+        update["max_anchors"] = min(config.background.max_anchors, most)
+    seconds = run.budget.seconds
+    if seconds is not None and seconds < _DRAFT_BACKGROUND:
+        update |= {"iterations": 80, "longest_side": 160}
+        update["max_anchors"] = min(5000, update.get("max_anchors", 5000))
+    elif seconds is not None and seconds < _QUICK_BACKGROUND:
+        update |= {"iterations": 400, "longest_side": 400}
+        update["max_anchors"] = min(5000, update.get("max_anchors", 5000))
+    return update

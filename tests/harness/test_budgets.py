@@ -1,0 +1,74 @@
+"""Budgets of a run: handed on to methods that keep them, and refused with a word where a method does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from splashbench.cli.main import main
+from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Run
+from splashbench.harness.runner import run_method
+from splashbench.submission import Budget, Submission
+
+METHOD = '''
+from splashbench.harness.contract import Decision, Method, MethodConfig
+from splashbench_methods.controls.nothing import Nothing
+
+
+class Thrifty(Nothing):
+    id = "thrifty"
+    budgets = ("seconds",)
+
+    def fit(self, scene, config, run):
+        run.decide(Decision(name="told", basis="budget", chosen=f"{run.budget.seconds:g} s", because="of the user"))
+        assert run.seconds < 60
+        return super().fit(scene, config, run)
+'''
+
+
+@pytest.fixture
+def thrifty(tmp_path: Path) -> str:
+    path = tmp_path / "thrifty.py"
+    path.write_text(METHOD)
+    return f"{path}:Thrifty"
+
+
+def test_a_budget_reaches_the_method_and_stands_in_the_submission(
+    thrifty: str, balls_directory: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run_method(thrifty, balls_directory, out, budget=Budget(seconds=60), timing_frames=0)
+    submission = Submission.open(out)
+    assert submission.identity.budget == Budget(seconds=60)
+    assert [decision.chosen for decision in submission.record.decisions] == ["60 s"]
+
+
+def test_a_limit_that_a_method_does_not_keep_to_is_refused(thrifty: str, balls_directory: Path, tmp_path: Path) -> None:
+    with pytest.raises(SplashbenchError, match=r"keeps to no budget of memory \(to those of: seconds\)"):
+        run_method(thrifty, balls_directory, tmp_path / "out", budget=Budget(seconds=60, memory_bytes=10**9))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "many", "1e12"])
+@pytest.mark.parametrize("option", ["--budget-seconds", "--budget-mb", "--budget-memory"])
+def test_what_is_no_budget_is_a_usage_error(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "nothing", "SCENE", "OUT", f"{option}={value}"])
+    assert option in capsys.readouterr().err
+
+
+def test_limits_are_positive_and_finite() -> None:
+    assert Budget().limits == {}
+    assert Budget(seconds=2).limits == {"seconds": 2.0}
+    for wrong in ({"seconds": 0}, {"seconds": float("inf")}, {"storage_bytes": -1}, {"memory": 1}):
+        with pytest.raises(ValidationError):
+            Budget.model_validate(wrong)
+
+
+def test_the_clock_of_a_run_goes_on() -> None:
+    run = Run()
+    first = run.seconds
+    assert 0 <= first <= run.seconds < 5
