@@ -121,7 +121,9 @@ def within_bytes(
         rungs.append(Rung(value=f"{cells} cells", bought=fits, bytes=size))
         if fits or cells <= _FEWEST:
             break
-        config = with_cells(config, max(_FEWEST, round(cells * (room / size) ** 0.5)))
+        fewer = max(_FEWEST, round(cells * (room / size) ** 0.5))
+        exactly = {"observable": False, "voxel_pixels": 0.0, "clear_voxel_pixels": 0.0}
+        config = with_cells(config, fewer).model_copy(update=exactly)
         traced = trace(config)
     if len(rungs) > 1:
         cells = max(traced.observations.hull_grid.shape) - 1
@@ -144,15 +146,32 @@ def stored_estimate(traced: Traced) -> float:
 
 def background_update(config: SplashSplatConfig, run: Run) -> dict[str, int]:
     """Settings of the background that the run's budget asks for."""
-    update = {}
-    if run.budget.storage_bytes is not None:
-        most = max(100, int(_BACKGROUND_SHARE * run.budget.storage_bytes / _ANCHOR_BYTES))
-        update["max_anchors"] = min(config.background.max_anchors, most)
-    seconds = run.budget.seconds
+    own = config.background
+    update: dict[str, int] = {}
+    seconds, size = run.budget.seconds, run.budget.storage_bytes
     if seconds is not None and seconds < _DRAFT_BACKGROUND:
-        update |= {"iterations": 80, "longest_side": 160}
-        update["max_anchors"] = min(5000, update.get("max_anchors", 5000))
+        update = {"iterations": 80, "longest_side": 160, "max_anchors": 5000}
     elif seconds is not None and seconds < _QUICK_BACKGROUND:
-        update |= {"iterations": 400, "longest_side": 400}
-        update["max_anchors"] = min(5000, update.get("max_anchors", 5000))
-    return update
+        update = {"iterations": 400, "longest_side": 400, "max_anchors": 5000}
+    if size is not None:
+        most = max(100, int(_BACKGROUND_SHARE * size / _ANCHOR_BYTES))
+        update["max_anchors"] = min(most, update.get("max_anchors", own.max_anchors))
+    smaller = {name: value for name, value in update.items() if value < getattr(own, name)}
+    if smaller:
+        words = ", ".join(f"{name} {value}" for name, value in smaller.items())
+        rungs = [
+            Rung(value=f"{name} {number}", bought=number == value)
+            for name, value in smaller.items()
+            for number in (getattr(own, name), value)
+        ]
+        limit = f"{seconds:g} s" if seconds is not None else f"{(size or 0) / 1e6:.2f} MB"
+        run.decide(
+            Decision(
+                name="background for the budget",
+                basis="budget",
+                chosen=words[:100],
+                because=f"{limit} are to be kept",
+                rungs=rungs,
+            )
+        )
+    return smaller

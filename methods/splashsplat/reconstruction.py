@@ -175,7 +175,8 @@ def fit_liquid(
             def other_bytes(kept: np.ndarray) -> int:
                 return fixed + compressed_bytes(carrier_arrays(track, track.carriers.keep(kept)[0], config.carried))
 
-            stored, spent = storage.within_room(room() - _glass_bytes(appearance), stored, other_bytes)
+            beside = _glass_bytes(appearance) + (0 if occlusion is None else occlusion.stored_bytes)
+            stored, spent = storage.within_room(room() - beside, stored, other_bytes)
             if spent is not None:
                 run.decide(spent)
         return reconstruction(appearance, stored.kept, fit.sensitivity, stored.step)

@@ -13,7 +13,7 @@ from splashbench.harness.contract import Run
 from splashbench.harness.runner import run_method
 from splashbench.submission import Budget, Submission
 
-METHOD = '''
+METHOD = """
 from splashbench.harness.contract import Decision, Method, MethodConfig
 from splashbench_methods.controls.nothing import Nothing
 
@@ -26,7 +26,7 @@ class Thrifty(Nothing):
         run.decide(Decision(name="told", basis="budget", chosen=f"{run.budget.seconds:g} s", because="of the user"))
         assert run.seconds < 60
         return super().fit(scene, config, run)
-'''
+"""
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
 A fixed schedule runs all its iterations, at full rates (the paper) or down a half cosine. An adaptive one keeps the
 rates up while photographs that it withholds from the fit still get better explained, and brings them down once they do
-not: a scene gets as many iterations as it can use. An earning one does so once they get better by less than the time is
-worth that it takes.
+not: a scene gets as many iterations as it can use. An earning one is a fixed one that comes to its end sooner once they
+get better by less than the time is worth.
 """
 
 from __future__ import annotations
@@ -98,26 +98,28 @@ class Earned:
 
 
 class EarningSchedule:
-    """Full rates as long as withheld photographs gain what the time is worth, then a half cosine over half as many.
+    """Down a half cosine over `limit` iterations, as long as withheld photographs gain what the time is worth; once
+    they do not, from the rates of that moment down over half as many as there were.
 
     price: dB for each doubling of the time. before: iterations that would take as long as all that comes before the
-    first. limit: iterations at most, both parts together. every: iterations between two looks at the withheld
-    photographs; `_LOOKS` of them are averaged, and compared with as many before. Time is counted in iterations, so that
-    the same fit ends at the same iteration on any machine.
+    first. every: iterations between two looks at the withheld photographs; `_LOOKS` of them are averaged, and compared
+    with as many before. Time is counted in iterations, so that the same fit ends at the same iteration on any machine.
     """
 
     def __init__(self, limit: int, every: int, price: float, before: int, fall: float) -> None:
         self.limit, self.every, self.price, self.before, self.fall = limit, every, price, before, fall
         self.earned: list[Earned] = []
         self._looks: list[np.ndarray] = []
-        self._turn = round(limit / (1 + fall))
-        self._turned = False
-        #: whether looks can end the first part before the limit does
-        self.may_stop = 2 * _LOOKS * every < self._turn
+        # Where the fall begins, if it does; the last moment at which it would save anything.
+        self._turn: int | None = None
+        self._latest = round(limit / (1 + fall))
+        self._now = 0
+        #: whether looks can end the fit before the limit does
+        self.may_stop = 2 * _LOOKS * every < self._latest
 
     @property
     def withholds(self) -> bool:
-        return self.may_stop and not self._turned
+        return self.may_stop and self._turn is None and self._now < self._latest
 
     def due(self, iteration: int) -> bool:
         return self.withholds and iteration > 0 and iteration % self.every == 0
@@ -134,20 +136,23 @@ class EarningSchedule:
         found = Earned((iteration - stretch, iteration), float(now.mean()), float(gains.mean()), error, price)
         self.earned.append(found)
         if not found.pays:
-            self._turn = min(self._turn, iteration)
+            self._turn = iteration
 
     def factor(self, iteration: int) -> float | None:
+        self._now = iteration
         if iteration >= self._end:
             return None
-        self._turned = iteration >= self._turn
-        return _cosine((iteration - self._turn) / (self._end - self._turn)) if self._turned else 1.0
+        if self._turn is None:
+            return _cosine(iteration / self.limit)
+        left = _cosine((iteration - self._turn) / (self._end - self._turn)) - LOWEST
+        return LOWEST + left * (_cosine(self._turn / self.limit) - LOWEST) / (1 - LOWEST)
 
     def done(self, iteration: int) -> float:
         return iteration / self._end
 
     @property
     def _end(self) -> int:
-        return min(self.limit, max(self._turn + 1, round((1 + self.fall) * self._turn)))
+        return self.limit if self._turn is None else min(self.limit, max(round((1 + self.fall) * self._turn), 1))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_npz
+from splashbench.files import compressed_bytes, read_npz, write_npz
 from splashbench.observe.container import depth_image, hidden_share
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
@@ -83,14 +83,23 @@ class LiquidOcclusion:
 
     def save(self, directory: Path) -> None:
         """Write container.npz into `directory`."""
-        arrays = {
+        write_npz(directory / _FILE, self._arrays)
+
+    @property
+    def stored_bytes(self) -> int:
+        """How much `save` writes, to within a kilobyte."""
+        return compressed_bytes(self._arrays)
+
+    @property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        arrays: dict[str, np.ndarray] = {
             "vertices": self.mesh.vertices,
-            "faces": self.mesh.faces,
+            "faces": self.mesh.faces.astype(np.int32),
             "tolerance": np.array([self.tolerance]),
         }
         if self.room is not None and self.up is not None:
             arrays |= {"room": self.room, "up": self.up}
-        np.savez_compressed(directory / _FILE, allow_pickle=False, **arrays)
+        return arrays
 
     @classmethod
     def load(cls, directory: Path) -> LiquidOcclusion | None:

@@ -169,14 +169,40 @@ def earning(quality: Callable[[int], float], price: float = 0.1, limit: int = 60
 def test_iterations_end_when_they_gain_less_than_their_time_is_worth():
     # Half a decibel for each doubling of the iterations: worth it until the time hardly doubles any more.
     slow = earning(lambda n: 20 + 0.5 * np.log2(n))
-    fast = earning(lambda n: 20 + 0.02 * np.log2(n))
     never = earning(lambda n: 20.0)
     assert slow[1] == 6000
     assert never[1] == 1200  # eight looks, and half as many iterations in which the rates fall
-    assert 1200 <= fast[1] < 1500
     assert all(stretch.pays for stretch in slow[0].earned)
     assert [stretch.pays for stretch in never[0].earned] == [False]
     assert never[0].earned[0].standard_error == pytest.approx(0, abs=1e-9)
+
+
+def test_one_that_pays_to_the_end_has_the_rates_of_a_fixed_one():
+    limit = 3000
+    schedule = EarningSchedule(limit, every=100, price=0.1, before=1500, fall=0.5)
+    found, withheld_until = [], 0
+    for iteration in range(limit):
+        if schedule.due(iteration):
+            schedule.look(iteration, WithheldLook(0.0, np.full(3, float(iteration))))
+        found.append(schedule.factor(iteration))
+        withheld_until = iteration if schedule.withholds else withheld_until
+    assert found == factors(FixedSchedule(limit, anneal=True))
+    # No photograph is withheld once there is nothing to be saved any more.
+    assert withheld_until == 1999
+
+
+def test_rates_go_on_falling_from_where_they_were():
+    schedule = EarningSchedule(6000, every=100, price=0.1, before=1500, fall=0.5)
+    found: list[float] = []
+    while (factor := schedule.factor(len(found))) is not None:
+        found.append(factor)
+        if schedule.due(len(found)):
+            schedule.look(len(found), WithheldLook(0.0, np.full(3, min(len(found), 1500) / 100)))
+    steps = -np.diff(found)
+    assert (steps >= -1e-12).all()
+    assert steps.max() < 0.01
+    assert found[-1] == pytest.approx(LOWEST, abs=1e-3)
+    assert 2000 < len(found) < 3500
 
 
 def test_a_higher_price_gives_fewer_iterations():
