@@ -244,7 +244,7 @@ def _grid_decision(found: Observable, wanted: float, metres: float | None) -> De
         chosen=length(wanted),
         because=f"{_SHARE_OF_OBSERVABLE:g} of the smallest length that the cameras can show",
         rungs=[
-            Rung(value=f"{name}: {length(pixels)}", bought=name == "all together", reason=reason)
+            Rung(value=f"{name}: {length(pixels)}", bought=True, reason=reason)
             for name, (pixels, reason) in terms.items()
         ],
     )
