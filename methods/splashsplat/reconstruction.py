@@ -232,6 +232,7 @@ def _tracking(observations: Observations, scene: TrainingScene, config: SplashSp
         uncovered=uncovered if config.coverage_reach > 0 else None,
         landed=observations.landed if config.ballistic else None,
         simulation=_simulation(observations, scene, seed) if config.variant == "flip" else None,
+        keep_deformation=not config.carried,
     )
 
 

@@ -53,8 +53,8 @@ class SplashSplatConfig(MethodConfig):
     voxel_pixels: float = Field(0.6, ge=0, le=16)
     #: the same in a transparent container, whose liquid is seen through its sides
     clear_voxel_pixels: float = Field(0.8, ge=0, le=16)
-    #: edge of a hull voxel by the smallest length that the scene's cameras can show, as measured before the fit, in
-    #: place of `voxel_pixels` and `clear_voxel_pixels`
+    #: edge of a hull voxel by the smallest length that the scene's cameras can show, as measured before the fit, where
+    #: that is more than `voxel_pixels`; in place of `clear_voxel_pixels`
     observable: bool = False
     #: hull cells along the longest side that `voxel_pixels` and `clear_voxel_pixels` leave at least
     fewest_cells: int = Field(128, ge=16, le=512)
@@ -221,7 +221,13 @@ class SplashSplatConfig(MethodConfig):
     }
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "best": {"storage_tolerance": 0.01},
-        "auto": {"observable": True, "validation_share": 0.04, "price": 0.1},
+        "auto": {
+            "observable": True,
+            "validation_share": 0.04,
+            "price": 0.1,
+            "idle_share": 0.05,
+            "prune_opacity": 0.03,
+        },
         "paper": {
             "hull_cells": 176,
             "transport_cells": 96,

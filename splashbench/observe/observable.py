@@ -142,8 +142,8 @@ def _softness(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.f
 def _disagreement(
     silhouettes: Silhouettes, frames: Sequence[int], bounds: Bounds, container: ContainerOcclusion | None
 ) -> float:
-    """Width of the rim of masks that no place along the line of sight explains to the others, pixels: the median over
-    views and frames."""
+    """Width of the rim of masks that no place along the line of sight explains to the others, pixels: the mean over
+    views and frames, as most of an outline may stand still."""
     cameras = silhouettes.cameras
     depths = None
     if container is not None and container.hides:
@@ -156,7 +156,7 @@ def _disagreement(
             others = [other for other in trusted if other != view]
             if others and (inside[view] < 0).any():
                 widths.append(_rim(silhouettes, view, others, inside, bounds, depths))
-    return float(np.median(widths)) if widths else 0.0
+    return float(np.mean(widths)) if widths else 0.0
 
 
 def _rim(

@@ -479,7 +479,9 @@ def fit_appearance(
         heads.step()
         features.step(target.frame, by_feature, factor, active.places)
         scales.step(active.ids, by_scale, factor)
-        if averages is not None and schedule.withholds:
+        if averages is not None and not schedule.withholds:
+            averages = None  # large, and not wanted any more
+        if averages is not None:
             averages.add(active.ids, torch.cat(learned(target.frame, active), dim=1))
         if glass is not None:
             glass.step(others[len(parameters) :], factor)

@@ -7,13 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 
 
+def undeformed(count: int) -> np.ndarray:
+    """F of `count` rows that is the identity and takes no memory: float32 [count, 3, 3], read-only."""
+    return np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
+
+
+def taken(deformation: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Some rows (bool [R] or int64 [n]) of F; of `undeformed` ones no memory is taken either."""
+    if deformation.strides[0] == 0:
+        return undeformed(int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows))
+    return np.asarray(deformation[rows])
+
+
 @dataclass
 class Carriers:
     """All carriers of a sequence, frame by frame.
 
     starts: int64 [T + 1]; the rows of frame t are starts[t]:starts[t + 1] of the arrays below. ids: int32 [R] carrier
-    of each row, ascending within a frame. positions: float32 [R, 3] transport-grid coordinates. deformation: float32
-    [R, 3, 3], F. phi: float32 [R] at the carrier, transport voxels. count: number of carriers in all.
+    of each row, ascending within a frame. positions: float32 [R, 3] transport-grid coordinates. deformation: float16
+    or float32 [R, 3, 3], F: the largest of these arrays. phi: float32 [R] at the carrier, transport voxels. count:
+    number of carriers in all.
     """
 
     starts: np.ndarray
@@ -53,7 +66,7 @@ class Carriers:
             starts,
             new[self.ids[rows]],
             self.positions[rows],
-            self.deformation[rows],
+            taken(self.deformation, rows),
             self.phi[rows],
             len(old),
         )

@@ -87,7 +87,8 @@ class Track:
     def moved(self, t: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """Where frame `t`'s carriers are (transport grid), and their F, a `fraction` of a step after the frame."""
         rows = self.carriers.rows(t)
-        positions, deformation = self.carriers.positions[rows], self.carriers.deformation[rows]
+        positions = self.carriers.positions[rows]
+        deformation = self.carriers.deformation[rows].astype(np.float32, copy=False)
         if fraction == 0 or len(positions) == 0:
             return positions, deformation
         return self.motion.step(t if fraction > 0 else t - 1).forecast(positions, deformation, fraction)

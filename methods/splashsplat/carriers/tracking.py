@@ -18,7 +18,7 @@ from splashbench.observe.kernels import sample
 
 from ..motion.steps import FrameStep
 from .correction import correct
-from .population import Carriers
+from .population import Carriers, undeformed
 from .resampling import ShellSettings, cell_of, newborns, within_capacity
 
 TrackingVariant = Literal["full", "no_resampling", "per_frame", "flip"]
@@ -65,6 +65,7 @@ class Tracking:
     [N, 3], which of them a view sees (bool [N]); where given, no carrier is born elsewhere. uncovered: given t and
     phi_t, where (hull-grid coordinates [N, 3]) carriers are born beyond the shell, for pixels without any. landed:
     given t, where carriers are in frame t - 1 and where they fly to, where they come to rest in frame t, all [N, 3].
+    keep_deformation: whether `carriers` tells F; where the motion alone makes it, it can be had from that.
     simulation: makes one from phi_t, ids and positions of the first carriers; the variant "flip" needs it.
     """
 
@@ -76,6 +77,7 @@ class Tracking:
     uncovered: Callable[[int, np.ndarray], np.ndarray] | None = None
     landed: Callable[[int, np.ndarray, np.ndarray], np.ndarray] | None = None
     simulation: Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation] | None = None
+    keep_deformation: bool = True
 
 
 class CarrierTracker:
@@ -114,12 +116,16 @@ class CarrierTracker:
         born = len(self._last_frames)
         if self._settings.variant not in ("no_resampling", "flip") or born == 0:
             self._resample(t, phi, born)
-        self._frames.append((self._ids, self._x, self._F, sample(phi, self._x * self._ratio)))
+        deformation = self._F if self._tracking.keep_deformation else undeformed(len(self._ids))
+        self._frames.append((self._ids, self._x, deformation, sample(phi, self._x * self._ratio)))
 
     def carriers(self) -> Carriers:
         """The carriers of all frames so far."""
         starts = np.concatenate([[0], np.cumsum([len(ids) for ids, *_ in self._frames])]).astype(np.int64)
-        ids, positions, deformation, phi = (np.concatenate(column) for column in zip(*self._frames))
+        columns = list(zip(*self._frames))
+        ids, positions, phi = (np.concatenate(columns[number]) for number in (0, 1, 3))
+        deformation = np.concatenate(columns[2]) if self._tracking.keep_deformation else undeformed(len(ids))
+        self._frames = []
         return Carriers(starts, ids, positions, deformation, phi, len(self._last_frames))
 
     def _forecast(self, t: int, phi: np.ndarray, step: FrameStep) -> None:

@@ -185,7 +185,7 @@ def observe(
     if settings.observable:
         with run.stage("observable length"):
             found = observable(scene, silhouettes, bounds, container)
-        wanted = max(_SHARE_OF_OBSERVABLE * found.pixels, 1e-3)
+        wanted = max(_SHARE_OF_OBSERVABLE * found.pixels, settings.voxel_pixels, 1e-3)
         run.decide(_grid_decision(found, wanted, scene.metres_per_unit))
         voxel_pixels = wanted
     hull_cells, transport_cells = _cells(bounds, scene, settings, voxel_pixels)
@@ -242,7 +242,7 @@ def _grid_decision(found: Observable, wanted: float, metres: float | None) -> De
         name="hull voxel",
         basis="scene",
         chosen=length(wanted),
-        because=f"{_SHARE_OF_OBSERVABLE:g} of the smallest length that the cameras can show",
+        because=f"{_SHARE_OF_OBSERVABLE:g} of the smallest length that the cameras can show, or voxel_pixels if larger",
         rungs=[
             Rung(value=f"{name}: {length(pixels)}", bought=True, reason=reason)
             for name, (pixels, reason) in terms.items()

@@ -16,7 +16,7 @@ from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 from splashbench.scene.geometry import STEPS_PER_VOXEL
 
-from ..carriers.population import Carriers
+from ..carriers.population import Carriers, taken
 from ..motion.steps import Motion
 from ..motion.velocity import factors
 
@@ -61,7 +61,7 @@ def stored_order(carriers: Carriers, shape: tuple[int, int, int]) -> Carriers:
         carriers.starts,
         ids[rows],
         carriers.positions[rows],
-        carriers.deformation[rows],
+        taken(carriers.deformation, rows),
         carriers.phi[rows],
         carriers.count,
     )
@@ -74,16 +74,17 @@ def store_rows(carriers: Carriers, control: NDArray[np.int16], motion: Motion, g
     lives = ends.astype(np.int64) - births + 1
     if (np.diff(births) < 0).any() or (lives < 1).any() or lives.sum() != len(carriers.ids):
         raise ValueError("carriers must be numbered by the frame of their birth and last without a gap")
-    steps = _clipped(np.rint(carriers.positions.astype(np.float64) * POSITION_STEPS), grid.shape)
-    cells, within = _split(steps[_first_rows(carriers)], grid.shape)
+    cells, within = _steps_of(carriers.positions[_first_rows(carriers)], grid.shape)
     residuals = []
+    steps = _whole(carriers.positions[carriers.rows(0)], grid.shape)
     for t in range(1, carriers.n_frames):
         before, now = carriers.rows(t - 1), carriers.rows(t)
         stays = births[carriers.ids[now]] < t
         places = np.searchsorted(carriers.ids[before], carriers.ids[now][stays])
-        predicted = _predicted(steps[before][places], control[t - 1], motion, grid.shape)
-        residuals.append(steps[now][stays] - predicted)
-    joined = np.concatenate(residuals) if residuals else np.zeros((0, 3), np.int64)
+        predicted = _predicted(steps[places], control[t - 1], motion)
+        steps = _whole(carriers.positions[now], grid.shape)
+        residuals.append((steps[stays] - predicted).astype(np.int32))
+    joined = np.concatenate(residuals) if residuals else np.zeros((0, 3), np.int32)
     kind = np.min_scalar_type(-int(np.abs(joined).max(initial=0)) - 1)
     return StoredRows(
         np.bincount(births, minlength=carriers.n_frames)[: carriers.n_frames].astype(np.uint32),
@@ -119,8 +120,16 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
     firsts = np.concatenate([[0], np.cumsum(stored.births, dtype=np.int64)])
     ids = np.zeros(0, dtype=np.int32)
     steps, deformation = np.zeros((0, 3), np.int64), np.zeros((0, 3, 3), np.float32)
-    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-    at = 0
+    # Filled frame by frame: parts that are joined would be in memory twice.
+    total, row, at = int(lives.sum()), 0, 0
+    read = Carriers(
+        np.zeros(n_frames + 1, dtype=np.int64),
+        np.empty(total, dtype=np.int32),
+        np.empty((total, 3), dtype=np.float32),
+        np.empty((total, 3, 3), dtype=np.float16),
+        np.empty(total, dtype=np.float32),
+        count,
+    )
     for t in range(n_frames):
         if len(ids):
             stays = ends[ids] > t
@@ -128,16 +137,18 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
             ids, steps, deformation = ids[stays], steps[stays], deformed[stays]
             moves = stored.residuals[at : at + len(ids)]
             at += len(ids)
-            steps = _clipped(_predicted(steps, control[t - 1], motion, grid.shape) + moves, grid.shape)
+            steps = _clipped(_predicted(steps, control[t - 1], motion) + moves, grid.shape)
         new = slice(int(firsts[t]), int(firsts[t + 1]))
         ids = np.concatenate([ids, np.arange(new.start, new.stop, dtype=np.int32)])
         steps = np.concatenate([steps, born[new]])
         deformation = np.concatenate([deformation, np.broadcast_to(identity, (new.stop - new.start, 3, 3))])
+        rows = slice(row, row + len(ids))
         positions = _voxels(steps)
-        parts.append((ids, positions, deformation, sample(phi[t], positions) / np.float32(STEPS_PER_VOXEL)))
-    starts = np.concatenate([[0], np.cumsum([len(part[0]) for part in parts])]).astype(np.int64)
-    columns = [np.concatenate(column) for column in zip(*parts)]
-    return Carriers(starts, columns[0], columns[1], columns[2], columns[3], count)
+        read.ids[rows], read.positions[rows], read.deformation[rows] = ids, positions, deformation
+        read.phi[rows] = sample(phi[t], positions) / np.float32(STEPS_PER_VOXEL)
+        row = rows.stop
+        read.starts[t + 1] = row
+    return read
 
 
 def _voxels(steps: np.ndarray) -> np.ndarray:
@@ -156,20 +167,21 @@ def _clipped(steps: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
 
 
 def _steps_of(positions: np.ndarray, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    return _split(_clipped(np.rint(positions.astype(np.float64) * POSITION_STEPS), shape), shape)
-
-
-def _split(steps: np.ndarray, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Cells [n, 3], and places in them in steps."""
+    steps = _whole(positions, shape)
     return steps // POSITION_STEPS, steps % POSITION_STEPS
+
+
+def _whole(positions: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Places in whole steps, int64 [n, 3]."""
+    return _clipped(np.rint(positions.astype(np.float64) * POSITION_STEPS), shape)
 
 
 def _cell_numbers(cells: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     return (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
 
 
-def _predicted(
-    steps: np.ndarray, control: NDArray[np.int16], motion: Motion, shape: tuple[int, int, int]
-) -> np.ndarray:
+def _predicted(steps: np.ndarray, control: NDArray[np.int16], motion: Motion) -> np.ndarray:
     """Where the motion leads from `steps` [n, 3] in one frame, int64 [n, 3]: by the velocity there."""
     nodes = np.array(control.shape[:3])
     wide = np.array(factors(motion.factor), dtype=np.float64)

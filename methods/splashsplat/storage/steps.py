@@ -50,6 +50,7 @@ class Storage:
         assert fit.sensitivity is not None
         self._known, self._kept = fit.sensitivity, kept
         self._exact = appearance.features, appearance.log_scales
+        self._scratch = self._exact[0].clone(), self._exact[1].clone()
         self._values = learned_values(appearance)
         rng = np.random.default_rng([seed, 6])
         self._photographs = sorted(rng.permutation(fit.photographs)[:_PHOTOGRAPHS].tolist())
@@ -155,7 +156,8 @@ class Storage:
     def _trial(self, stored: Stored) -> Trial:
         read = torch.from_numpy(read_values(self._coded(stored)))
         rows = np.flatnonzero(stored.kept)
-        features, scales = self._exact[0].clone(), self._exact[1].clone()
+        # Carriers that are not kept are not shown, or left out of the photographs by the fit.
+        features, scales = self._scratch
         size = features.shape[1]
         features[rows], scales[rows] = read[:, :size], read[:, size:]
         if float(scales.max()) > float(self._exact[1].max()) + _GROWN:

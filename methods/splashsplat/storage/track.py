@@ -75,5 +75,5 @@ def read_track(arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times
     if deformation is not None:
         if deformation.shape != carriers.deformation.shape:
             raise ValueError(f"deformation of shape {deformation.shape} does not fit {len(carriers.ids)} rows")
-        carriers = replace(carriers, deformation=deformation.astype(np.float32))
+        carriers = replace(carriers, deformation=deformation)
     return Track(grid, carriers, motion, phi)

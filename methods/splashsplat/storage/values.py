@@ -8,6 +8,7 @@ section 10.3.3). Not in the paper.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ from ..appearance.sensitivity import Sensitivity
 LEAST, MOST = -2, 3
 # Of a coefficient, in whole steps.
 _LARGEST = 2**30
+# Carriers that are transformed at once.
+_PART = 1 << 15
 # Share of the largest eigenvalue below which directions of the metric count as if they had it.
 _FLOOR = 1e-6
 
@@ -44,36 +47,52 @@ class _Transform:
 
 
 def _transform(values: NDArray[np.float32], sensitivity: Sensitivity) -> _Transform:
-    wide = values.astype(np.float64)
-    share = np.maximum(sensitivity.carriers.astype(np.float64), 1e-12)
-    share /= max(share.sum(), 1e-12)
-    center = share @ wide if len(values) else np.zeros(values.shape[1])
+    count, size = values.shape
+    weights = np.maximum(sensitivity.carriers.astype(np.float64), 1e-12)
+    share = weights / max(weights.sum(), 1e-12)
+    center = sum((share[rows] @ values[rows] for rows in _parts(count)), np.zeros(size))
+    spread = np.zeros((size, size))
+    for rows in _parts(count):
+        part = (values[rows] - center) * np.sqrt(share[rows])[:, None]
+        spread += part.T @ part
     root, back = _roots(sensitivity.metric)
-    spread = (wide - center) * np.sqrt(share)[:, None]
-    _, turn = np.linalg.eigh(root @ (spread.T @ spread) @ root)
+    _, turn = np.linalg.eigh(root @ spread @ root)
     turn = turn[:, ::-1]
     return _Transform(center, root @ turn, turn.T @ back)
 
 
+def _parts(count: int) -> Iterator[slice]:
+    """Rows by the ten thousands: double precision of all of them would be the largest thing in memory."""
+    for start in range(0, count, _PART):
+        yield slice(start, min(start + _PART, count))
+
+
 def typical_coefficient(values: NDArray[np.float32], sensitivity: Sensitivity) -> float:
     """Root mean square of the coefficients that `store_values` makes with a step of 1, before they are rounded."""
+    if not len(values):
+        return 1.0
     found = _transform(values, sensitivity)
-    return float(np.sqrt((((values - found.center) @ found.forward) ** 2).mean())) if len(values) else 1.0
+    squares = sum(float((((values[rows] - found.center) @ found.forward) ** 2).sum()) for rows in _parts(len(values)))
+    return float(np.sqrt(squares / values.size))
 
 
 def store_values(values: NDArray[np.float32], sensitivity: Sensitivity, step: float) -> StoredValues:
     """`values` [N, D] in whole numbers of steps; how long one is in the metric: `step`, times 2**coarseness."""
+    count, size = values.shape
     found = _transform(values, sensitivity)
     weights = np.maximum(sensitivity.carriers.astype(np.float64), 1e-12)
     coarseness = np.clip(np.rint(-0.5 * np.log2(weights)), LEAST, MOST).astype(np.int8)
-    scaled = (values - found.center) @ found.forward / (step * np.exp2(coarseness.astype(np.float64))[:, None])
-    whole = np.rint(np.clip(scaled, -_LARGEST, _LARGEST))
-    kind = np.min_scalar_type(-int(np.abs(whole).max(initial=0)) - 1)
+    coefficients = np.empty((size, count), dtype=np.int32)
+    for rows in _parts(count):
+        steps = step * np.exp2(coarseness[rows].astype(np.float64))
+        scaled = (values[rows] - found.center) @ found.forward / steps[:, None]
+        coefficients[:, rows] = np.rint(np.clip(scaled, -_LARGEST, _LARGEST)).T
+    largest = max(int(coefficients.max(initial=0)), -int(coefficients.min(initial=0)))
     return StoredValues(
         found.center.astype(np.float32),
         (found.basis * step).astype(np.float32),
         coarseness,
-        np.ascontiguousarray(whole.T).astype(kind),
+        coefficients.astype(np.min_scalar_type(-largest - 1)),
     )
 
 
@@ -85,10 +104,14 @@ def read_values(stored: StoredValues) -> NDArray[np.float32]:
     if count and (stored.coarseness.min() < LEAST or stored.coarseness.max() > MOST):
         raise ValueError(f"coarseness is not between {LEAST} and {MOST}")
     values = np.zeros((count, size), dtype=np.float32)
-    # Sums in one order, by single operations: the same floats on every machine.
-    for row, coefficients in zip(stored.basis, stored.coefficients):
-        values += coefficients.astype(np.float32)[:, None] * row
-    return values * np.exp2(stored.coarseness.astype(np.float32))[:, None] + stored.center
+    for rows in _parts(count):
+        part = values[rows]
+        # Sums in one order, by single operations: the same floats on every machine.
+        for row, coefficients in zip(stored.basis, stored.coefficients):
+            part += coefficients[rows].astype(np.float32)[:, None] * row
+        part *= np.exp2(stored.coarseness[rows].astype(np.float32))[:, None]
+        part += stored.center
+    return values
 
 
 def _roots(metric: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
