@@ -93,6 +93,7 @@ def trace_liquid(
         run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
     track = _track(observations, scene, config, run, run.progress)
     with run.stage("carriers"):
+        memory.give_back()
         steps = reach(config.decoder.opacity_slope, config.decoder.opacity_band)
         return Traced(observations, stored_track(track, scene.times, config.carried, steps), config)
 
@@ -165,6 +166,7 @@ def fit_liquid(
     if fit.sensitivity is None:
         return reconstruction(appearance, left)
     with run.stage("storing"), one_torch_thread():
+        memory.give_back()
         storage = Storage(appearance, left, fit, run.seed)
         stored, decision = storage.within_tolerance(config.storage_tolerance)
         run.decide(decision)

@@ -225,8 +225,6 @@ class SplashSplatConfig(MethodConfig):
             "observable": True,
             "validation_share": 0.04,
             "price": 0.1,
-            "idle_share": 0.05,
-            "prune_opacity": 0.03,
         },
         "paper": {
             "hull_cells": 176,

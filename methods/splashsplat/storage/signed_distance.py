@@ -27,13 +27,19 @@ def coarse_distance(packed: NDArray[np.int8], steps: int) -> NDArray[np.int8]:
 
     What is below 0 stays below it, and the other way round.
     """
-    whole = np.clip(packed // np.int8(_COARSER), -steps, steps - 1)
-    return (whole * _COARSER + _COARSER // 2).astype(np.int8)
+    coarse = np.empty_like(packed)
+    for t, frame in enumerate(packed):  # all frames at once would be in memory several times
+        whole = np.clip(frame // np.int8(_COARSER), -steps, steps - 1)
+        coarse[t] = whole * _COARSER + _COARSER // 2
+    return coarse
 
 
 def store_distance(packed: NDArray[np.int8]) -> NDArray[np.int8]:
     """What `coarse_distance` gave for all frames [T, nx, ny, nz], as it is stored."""
-    return np.diff(packed // np.int8(_COARSER), axis=0, prepend=np.int8(0))
+    stored = packed // np.int8(_COARSER)
+    for t in range(len(stored) - 1, 0, -1):
+        stored[t] -= stored[t - 1]
+    return stored
 
 
 def read_distance(stored: NDArray[np.int8]) -> NDArray[np.int8]:

@@ -18,7 +18,6 @@ from splashbench.files import compressed_bytes
 from splashbench.harness.contract import Decision, Rung
 
 from ..appearance.fitting import Appearance, Fit
-from .looks import learned_values
 from .tolerance import Loss, Trial, longest_step
 from .values import StoredValues, read_values, store_values, typical_coefficient
 
@@ -51,7 +50,6 @@ class Storage:
         self._known, self._kept = fit.sensitivity, kept
         self._exact = appearance.features, appearance.log_scales
         self._scratch = self._exact[0].clone(), self._exact[1].clone()
-        self._values = learned_values(appearance)
         rng = np.random.default_rng([seed, 6])
         self._photographs = sorted(rng.permutation(fit.photographs)[:_PHOTOGRAPHS].tolist())
         self._loss = Loss(fit.drawn, self._photographs, self._exact)
@@ -60,7 +58,7 @@ class Storage:
         """The longest step whose rounding adds no more than `tolerance` to the squared error in some training
         photographs, as a share of it; and how it was found."""
         rows = np.flatnonzero(self._kept)
-        first = max(typical_coefficient(self._values[rows], self._known.kept(rows)), 1e-9) / _FIRST
+        first = max(typical_coefficient(self._learned(rows), self._known.kept(rows)), 1e-9) / _FIRST
         trials = longest_step(tolerance, first, lambda step: self._trial(Stored(self._kept, step))) if len(rows) else []
         within = [found for found in trials if found.added <= tolerance]
         shortest = min((found.step for found in trials), default=first)
@@ -146,9 +144,13 @@ class Storage:
                 low = middle
         return Stored(start.kept, high)
 
+    def _learned(self, rows: np.ndarray) -> np.ndarray:
+        """Values of some carriers, made anew each time: those of all are among the largest arrays of a fit."""
+        return np.concatenate([table.numpy()[rows] for table in self._exact], axis=1)
+
     def _coded(self, stored: Stored) -> StoredValues:
         rows = np.flatnonzero(stored.kept)
-        return store_values(self._values[rows], self._known.kept(rows), stored.step)
+        return store_values(self._learned(rows), self._known.kept(rows), stored.step)
 
     def _value_bytes(self, stored: Stored) -> int:
         return compressed_bytes(vars(self._coded(stored)))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from splashbench.native import memory
 from splashbench.observe.grid import Grid
 
 from ..carriers.population import Carriers
@@ -30,22 +31,32 @@ def stored_track(track: Track, times: np.ndarray, carried: bool, distance_steps:
     times: [T] of the frames, seconds. carried: whether the motion is what moved the carriers; else their F is stored.
     distance_steps: of phi to either side, see `reach`.
     """
-    packed = coarse_distance(track.phi, distance_steps)
-    ordered = stored_order(track.carriers, track.grid.shape)
-    return read_track(
-        track_arrays(replace(track, carriers=ordered, phi=packed), carried), track.grid, times, track.motion.factor
+    coarse = replace(
+        track,
+        carriers=stored_order(track.carriers, track.grid.shape),
+        phi=coarse_distance(track.phi, distance_steps),
     )
+    rows, moves = carrier_arrays(coarse, coarse.carriers, carried), motion_arrays(track.motion)
+    phi = coarse.phi
+    del coarse
+    memory.give_back()
+    motion = _read_motion(moves, track.grid, times, track.motion.factor)
+    return Track(track.grid, _read_carriers(rows, moves, motion, phi, track.grid), motion, phi)
 
 
 def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]]:
     """What is stored of a track, by file. Of one that `stored_track` gave, this loses nothing."""
-    control = whole_velocities(track.motion.velocities)
-    jets, turn = table_of(track.motion.falls)
     return {
         "carriers": carrier_arrays(track, track.carriers, carried),
-        "motion": {"velocities": control, "jets": jets, "turn": turn},
+        "motion": motion_arrays(track.motion),
         "distance": {"phi": store_distance(track.phi)},
     }
+
+
+def motion_arrays(motion: Motion) -> dict[str, np.ndarray]:
+    """What is stored of a motion."""
+    jets, turn = table_of(motion.falls)
+    return {"velocities": whole_velocities(motion.velocities), "jets": jets, "turn": turn}
 
 
 def carrier_arrays(track: Track, carriers: Carriers, carried: bool) -> dict[str, np.ndarray]:
@@ -66,14 +77,24 @@ def read_track(arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times
     stored = arrays["distance"]["phi"]
     if stored.dtype != np.int8 or stored.shape != (n_frames, *grid.shape):
         raise ValueError(f"phi is {stored.dtype} {stored.shape}, not int8 of {n_frames} frames on {grid.shape} nodes")
-    falls = falls_of(arrays["motion"]["jets"], arrays["motion"]["turn"], grid, times)
-    motion = Motion(control.astype(np.float32) / np.float32(VELOCITY_STEPS), factor, falls)
+    motion = _read_motion(arrays["motion"], grid, times, factor)
     phi = read_distance(stored)
-    rows = StoredRows(**{name: arrays["carriers"][name] for name in CARRIERS})
-    carriers = read_rows(rows, control, motion, phi, grid)
-    deformation = arrays["carriers"].get("deformation")
+    return Track(grid, _read_carriers(arrays["carriers"], arrays["motion"], motion, phi, grid), motion, phi)
+
+
+def _read_motion(arrays: Mapping[str, np.ndarray], grid: Grid, times: np.ndarray, factor: Factor) -> Motion:
+    falls = falls_of(arrays["jets"], arrays["turn"], grid, times)
+    return Motion(arrays["velocities"].astype(np.float32) / np.float32(VELOCITY_STEPS), factor, falls)
+
+
+def _read_carriers(
+    arrays: Mapping[str, np.ndarray], moves: Mapping[str, np.ndarray], motion: Motion, phi: np.ndarray, grid: Grid
+) -> Carriers:
+    rows = StoredRows(**{name: arrays[name] for name in CARRIERS})
+    carriers = read_rows(rows, moves["velocities"], motion, phi, grid)
+    deformation = arrays.get("deformation")
     if deformation is not None:
         if deformation.shape != carriers.deformation.shape:
             raise ValueError(f"deformation of shape {deformation.shape} does not fit {len(carriers.ids)} rows")
         carriers = replace(carriers, deformation=deformation)
-    return Track(grid, carriers, motion, phi)
+    return carriers
