@@ -21,7 +21,7 @@ def iterations_decision(earned: Sequence[Earned], iterations: int) -> Decision:
         basis="withheld",
         chosen=f"{iterations} iterations",
         because=f"learning rates stay up while withheld photographs gain more than the time is worth; {ended}",
-        measure="PSNR of withheld training photographs at full learning rates, dB",
+        measure="PSNR of withheld photographs, dB",
         rungs=[
             Rung(
                 value=f"{stretch.iterations[1]} iterations",

@@ -233,10 +233,7 @@ def _grid_decision(found: Observable, wanted: float, metres: float | None) -> De
         "pixel": (1.0, "what a pixel spans at the liquid"),
         "edge": (found.edge or 0.0, f"the liquid's edge in the photographs {edge}"),
         "disagreement": (found.disagreement, "width of the rim of masks that the other views do not allow"),
-        "all together": (
-            found.pixels,
-            f"{found.angle:.0f} degrees between the views that differ most",
-        ),
+        "all together": (found.pixels, f"{length(found.pixels)}; views differ by up to {found.angle:.0f} degrees"),
     }
     return Decision(
         name="hull voxel",
@@ -244,7 +241,7 @@ def _grid_decision(found: Observable, wanted: float, metres: float | None) -> De
         chosen=length(wanted),
         because=f"{_SHARE_OF_OBSERVABLE:g} of the smallest length that the cameras can show, or voxel_pixels if larger",
         rungs=[
-            Rung(value=f"{name}: {length(pixels)}", bought=True, reason=reason)
+            Rung(value=f"{name}: {pixels:.2f} px", bought=True, reason=reason)
             for name, (pixels, reason) in terms.items()
         ],
     )
