@@ -314,6 +314,23 @@ def quality_over_time() -> Figure:
     return figure
 
 
+def capacity() -> Figure:
+    rows = read(HERE / "data" / "capacity.csv")
+    figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+    places = figure.subplots(1, 2)
+    units = (("seconds", "budget of seconds"), ("megabytes", "budget of megabytes"))
+    for place, (unit, title) in zip(places, units):
+        points = [(float(row["limit"]), float(row["psnr"])) for row in rows if row["budget"] == unit]
+        place.plot(*zip(*sorted(points)), "o-", color=BLUE, mfc="white", ms=4, lw=1.4)
+        place.set_xscale("log")
+        ticks = [limit for limit, _ in sorted(points)]
+        place.set_xticks(ticks, [f"{limit:g}" for limit in ticks], minor=False)
+        place.set_xticks([], minor=True)
+        place.set_xlabel(title)
+    places[0].set_title("PSNR, dB (thin_stream)")
+    return figure
+
+
 def whole_fit() -> Figure:
     rows = read(HERE / "data" / "by_scene.csv")
     phases = {row["metric"]: float(row["value"]) for row in rows if row["study"] == "whole_fit"}
@@ -344,6 +361,7 @@ CHARTS: dict[str, Callable[[], Figure]] = {
     "transport": transport,
     "told_nothing": told_nothing,
     "quality_over_time": quality_over_time,
+    "capacity": capacity,
     "whole_fit": whole_fit,
 }
 

@@ -6,7 +6,7 @@ How long a reconstruction on a finer grid takes is told from how long a coarse o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.scene.scene import TrainingScene
@@ -72,7 +72,8 @@ def within_seconds(scene: TrainingScene, config: SplashSplatConfig, run: Run) ->
         )
     )
     if chosen is None:
-        return Affordable(draft.model_copy(update={"iterations": config.iterations}), traced)
+        longer = traced.config.model_copy(update={"iterations": config.iterations})
+        return Affordable(longer, replace(traced, config=longer))
     return Affordable(with_cells(config, chosen))
 
 

@@ -12,7 +12,7 @@ from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench.submission import Budget
 from splashbench_methods.splashsplat import SplashSplat
-from splashbench_methods.splashsplat.affordable import background_update, with_cells
+from splashbench_methods.splashsplat.affordable import background_update, with_cells, within_seconds
 from splashbench_methods.splashsplat.appearance.schedule import LOWEST, Clock, TimedSchedule
 from splashbench_methods.splashsplat.method import FittedSplashSplat
 from splashbench_methods.splashsplat.settings import SplashSplatConfig
@@ -76,6 +76,14 @@ def test_seconds_choose_the_grids_by_how_long_the_draft_took(balls: Scene, monke
         if seconds == 1.0:
             assert decision.chosen.endswith("as the draft")
     assert cells[1] > cells[0]
+
+
+def test_the_draft_has_as_many_iterations_as_time_allows(balls: Scene) -> None:
+    config = SplashSplatConfig.preset("quick", SMALL | {"iterations": 5000})
+    assert isinstance(config, SplashSplatConfig)
+    found = within_seconds(balls.training(), config, Run(budget=Budget(seconds=0.5)))
+    assert found.traced is not None
+    assert found.traced.config.iterations == found.config.iterations == 5000
 
 
 def test_a_schedule_by_the_clock_ends_in_time_or_at_its_limit() -> None:
