@@ -23,6 +23,8 @@ _LONGER, _EXPONENT = 1.35, 2.15
 _BEFORE = 0.4
 # Below so many seconds there is the draft's background, below so many `quick`'s.
 _DRAFT_BACKGROUND, _QUICK_BACKGROUND = 45.0, 120.0
+# Seconds from which self-calibration, which takes 2 to 5 at 240x160, is no large part of a fit.
+_SELF_CALIBRATION = 30.0
 # Bytes of a background anchor as it is stored, and the share of a byte budget for all of them.
 _ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25
 # Bytes of a carrier's values, about; a track that takes more than this much of its room is traced anew, coarser.
@@ -37,6 +39,22 @@ class Affordable:
 
     config: SplashSplatConfig
     traced: Traced | None = None
+
+
+def affords_self_calibration(run: Run) -> bool:
+    """Whether the budget of seconds leaves time to look for clocks, cameras, exposures and masks that are off."""
+    seconds = run.budget.seconds
+    affords = seconds is None or seconds >= _SELF_CALIBRATION
+    if not affords:
+        run.decide(
+            Decision(
+                name="self-calibration",
+                basis="budget",
+                chosen="left out",
+                because=f"{seconds:g} s are to be kept, and it is worth its time from {_SELF_CALIBRATION:g} s on",
+            )
+        )
+    return affords
 
 
 def within_seconds(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> Affordable:

@@ -20,7 +20,7 @@ from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
 from splashbench.selfcalibration import self_calibration
 
-from .affordable import background_update, within_bytes, within_seconds
+from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
 from .appearance.decoder import Children
 from .appearance.fitting import composite
 from .carriers.between import carriers_at
@@ -178,7 +178,7 @@ class SplashSplat(Method):
                     plates,
                     lambda state, milestone: run.checkpoint(lambda: FittedSplashSplat(*state()), milestone),
                 )
-        if config.self_calibration:
+        if config.self_calibration and affords_self_calibration(run):
             with run.stage("self-calibration"):
                 calibration = self_calibration(scene, plates, lambda what: run.progress(0, what))
             if calibration:

@@ -75,6 +75,7 @@ def test_seconds_choose_the_grids_by_how_long_the_draft_took(balls: Scene, monke
         cells.append(max(fitted.liquid.grid.shape))
         if seconds == 1.0:
             assert decision.chosen.endswith("as the draft")
+        assert any(found.name == "self-calibration" for found in run.decisions) is (seconds == 1.0)
     assert cells[1] > cells[0]
 
 

@@ -121,9 +121,9 @@ def test_a_scene_that_is_soon_explained_is_soon_fitted(many_balls: Scene, monkey
     looks: list[tuple[int, float]] = []
     look = AdaptiveSchedule.look
 
-    def note(self: AdaptiveSchedule, iteration: int, loss: float) -> None:
-        look(self, iteration, loss)
-        looks.append((iteration, loss))
+    def note(self: AdaptiveSchedule, iteration: int, seen: WithheldLook) -> None:
+        look(self, iteration, seen)
+        looks.append((iteration, seen.loss))
 
     monkeypatch.setattr(AdaptiveSchedule, "look", note)
     monkeypatch.setattr(fit, "_LOOK_EVERY", 20)

@@ -136,11 +136,13 @@ def test_settings_reach_the_fit() -> None:
     presets = {name: SplashSplatConfig.model_validate(values) for name, values in SplashSplatConfig.presets.items()}
     assert {name: config.optimisation.feature_cells for name, config in presets.items()} == {
         "best": (4.0, 16.0),
+        "auto": (4.0, 16.0),
         "paper": (),
         "quick": (4.0, 16.0),
     }
     assert {name: config.optimisation.still_cell for name, config in presets.items()} == {
         "best": 2.0,
+        "auto": 2.0,
         "paper": 0.0,
         "quick": 2.0,
     }
