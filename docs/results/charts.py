@@ -320,7 +320,11 @@ def capacity() -> Figure:
     places = figure.subplots(1, 2)
     units = (("seconds", "budget of seconds"), ("megabytes", "budget of megabytes"))
     for place, (unit, title) in zip(places, units):
-        points = [(float(row["limit"]), float(row["psnr"])) for row in rows if row["budget"] == unit]
+        points = [
+            (float(row["limit"]), float(row["psnr"]))
+            for row in rows
+            if (row["budget"], row["scene"]) == (unit, "thin_stream")
+        ]
         place.plot(*zip(*sorted(points)), "o-", color=BLUE, mfc="white", ms=4, lw=1.4)
         place.set_xscale("log")
         ticks = [limit for limit, _ in sorted(points)]

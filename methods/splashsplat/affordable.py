@@ -29,6 +29,8 @@ _SELF_CALIBRATION = 30.0
 _ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25
 # Bytes of a carrier's values, about; a track that takes more than this much of its room is traced anew, coarser.
 _VALUE_BYTES, _TOO_LARGE = 4.5, 1.5
+# Share of the carriers that the fit leaves.
+_LEFT = 0.5
 # Traces of one scene, and cells along a side, at the least.
 _TRACES, _FEWEST = 4, 32
 
@@ -131,7 +133,9 @@ def within_bytes(
     limit = run.budget.storage_bytes
     if limit is None:
         return traced
-    room = (1 - _BACKGROUND_SHARE) * limit
+    occlusion = traced.observations.occlusion
+    beside = 0 if occlusion is None else occlusion.stored_bytes
+    room = max((1 - _BACKGROUND_SHARE) * limit - beside, 1.0)
     rungs = []
     for _ in range(_TRACES):
         cells = max(traced.observations.hull_grid.shape) - 1
@@ -160,7 +164,9 @@ def within_bytes(
 
 def stored_estimate(traced: Traced) -> float:
     """Bytes that the liquid will take, about: half of the carriers are pruned by the fit."""
-    return traced.track_bytes + 0.5 * _VALUE_BYTES * traced.track.carriers.count
+    files = traced.track_bytes
+    carriers = files["carriers"] + _VALUE_BYTES * traced.track.carriers.count
+    return files["motion"] + files["distance"] + _LEFT * carriers
 
 
 def background_update(config: SplashSplatConfig, run: Run) -> dict[str, int]:

@@ -69,10 +69,10 @@ class Traced:
     config: SplashSplatConfig
 
     @property
-    def track_bytes(self) -> int:
-        """How much of the files the track takes."""
+    def track_bytes(self) -> dict[str, int]:
+        """How much of the files the track takes: "carriers", "motion" and "distance"."""
         arrays = track_arrays(self.track, self.config.carried)
-        return sum(compressed_bytes(file) for file in arrays.values())
+        return {name: compressed_bytes(file) for name, file in arrays.items()}
 
 
 def _clock(run: Run) -> Clock | None:

@@ -25,6 +25,18 @@ _FILE = "container.npz"
 _MAX_CAMERAS = 24
 
 
+def _in_single_precision(mesh: ContainerMesh) -> ContainerMesh:
+    """`mesh` with its vertices rounded; itself where that would make two of them one."""
+    rounded = ContainerMesh(mesh.vertices.astype(np.float32), mesh.faces)
+    return rounded if np.array_equal(rounded.faces, mesh.faces) else mesh
+
+
+def _smallest(vertices: np.ndarray) -> np.ndarray:
+    """`vertices` in single precision where that loses nothing."""
+    single = vertices.astype(np.float32)
+    return single if np.array_equal(single, vertices) else vertices
+
+
 class LiquidOcclusion:
     """An opaque container between cameras and liquid.
 
@@ -39,7 +51,8 @@ class LiquidOcclusion:
         room: np.ndarray | None = None,
         up: np.ndarray | None = None,
     ) -> None:
-        self.mesh, self.tolerance = mesh, tolerance
+        # As it is stored: a saved container hides the same.
+        self.mesh, self.tolerance = _in_single_precision(mesh), tolerance
         self.room, self.up = room, up
         self._depths: dict[int, tuple[Camera, np.ndarray]] = {}
         self._walls: dict[int, tuple[Camera, NearWall | None]] = {}
@@ -93,7 +106,7 @@ class LiquidOcclusion:
     @property
     def _arrays(self) -> dict[str, np.ndarray]:
         arrays: dict[str, np.ndarray] = {
-            "vertices": self.mesh.vertices,
+            "vertices": _smallest(self.mesh.vertices),
             "faces": self.mesh.faces.astype(np.int32),
             "tolerance": np.array([self.tolerance]),
         }
