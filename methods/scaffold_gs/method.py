@@ -37,6 +37,7 @@ class ScaffoldGS(Method):
 
     id: ClassVar[str] = "scaffold_gs"
     title: ClassVar[str] = "Scaffold-GS, static"
+    version: ClassVar[str] = "2"  # since backgrounds are stored in whole steps
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
 
     def fit(self, scene: TrainingScene, config: BackgroundSettings, run: Run) -> Fitted:
