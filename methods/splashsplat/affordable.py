@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.scene.scene import TrainingScene
 
+from .fields.container import KnownContainer
 from .reconstruction import Traced, trace_liquid
 from .settings import SplashSplatConfig
 
 # Hull cells along the longest side that may be chosen.
 _CELLS = (128, 160, 200, 240, 300)
 # By how much longer a trace takes than the draft's, at as many cells; and how that grows with cells along a side.
-# Measured on opaque_bowl and glass_tank, whose exponents were 2.0 and 2.3.
+# Chosen by four traces of opaque_bowl and glass_tank, which these tell to within a fifth.
 _LONGER, _EXPONENT = 1.35, 2.15
 # Share of the seconds that what comes before the appearance may take.
 _BEFORE = 0.4
@@ -28,7 +29,7 @@ _SELF_CALIBRATION = 30.0
 # Bytes of a background anchor as it is stored, and the share of a byte budget for all of them.
 _ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25
 # Bytes of a carrier's values, about; a track that takes more than this much of its room is traced anew, coarser.
-_VALUE_BYTES, _TOO_LARGE = 4.5, 1.5
+_VALUE_BYTES, _TOO_LARGE = 6.0, 1.5
 # Share of the carriers that the fit leaves.
 _LEFT = 0.5
 # Traces of one scene, and cells along a side, at the least.
@@ -59,24 +60,29 @@ def affords_self_calibration(run: Run) -> bool:
     return affords
 
 
-def within_seconds(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> Affordable:
+def within_seconds(
+    scene: TrainingScene, config: SplashSplatConfig, run: Run, known: KnownContainer | None = None
+) -> Affordable:
     """The finest grids whose trace leaves most of `run.budget.seconds` to the appearance; `config` without a budget.
 
-    The draft's trace is made to tell how long others take, and taken where no other is affordable.
+    known: the container, where it was looked for already. The draft's trace is made to tell how long others take, and
+    taken where no other is affordable.
     """
     seconds = run.budget.seconds
     if seconds is None:
         return Affordable(config)
     start = run.seconds
     draft = config.draft()
-    traced = trace_liquid(scene, draft, run)
+    traced = trace_liquid(scene, draft, run, known)
     took = max(run.seconds - start, 1e-3)
     cells = max(traced.observations.hull_grid.shape) - 1
     left = seconds - run.seconds
     full = _cells_of(traced, config)
     options = sorted({min(option, full) for option in _CELLS})
     predicted = {option: _LONGER * took * (option / cells) ** _EXPONENT for option in options}
-    chosen = max((option for option in options if predicted[option] <= _BEFORE * left), default=None)
+    # The draft's carriers are those of one variant of the method.
+    least = None if config.variant == "full" else options[0]
+    chosen = max((option for option in options if predicted[option] <= _BEFORE * left), default=least)
     rungs = [Rung(value=f"draft, {cells} cells", bought=chosen is None, seconds=took)]
     rungs += [
         Rung(value=f"{option} cells", bought=option == chosen, seconds=predicted[option] - took) for option in options
@@ -100,7 +106,7 @@ def within_seconds(scene: TrainingScene, config: SplashSplatConfig, run: Run) ->
 def _cells_of(traced: Traced, config: SplashSplatConfig) -> int:
     """Hull cells along the longest side that `config` has on a scene whose draft was `traced`."""
     cells = max(traced.observations.hull_grid.shape) - 1
-    # The draft's voxels span `draft` pixels, unless that were too few of them.
+    # By the pixels that a voxel of the draft spans, unless there were too many or too few for that.
     draft = config.draft()
     if config.voxel_pixels == 0 or cells >= draft.hull_cells or cells <= draft.fewest_cells:
         return config.hull_cells
@@ -136,25 +142,25 @@ def within_bytes(
     occlusion = traced.observations.occlusion
     beside = 0 if occlusion is None else occlusion.stored_bytes
     room = max((1 - _BACKGROUND_SHARE) * limit - beside, 1.0)
-    rungs = []
-    for _ in range(_TRACES):
+    rungs: list[Rung] = []
+    first_size = stored_estimate(traced)
+    for left in reversed(range(_TRACES)):
         cells = max(traced.observations.hull_grid.shape) - 1
         size = stored_estimate(traced)
-        fits = size <= _TOO_LARGE * room
-        rungs.append(Rung(value=f"{cells} cells", bought=fits, bytes=size))
-        if fits or cells <= _FEWEST:
+        last = size <= _TOO_LARGE * room or cells <= _FEWEST or left == 0
+        rungs.append(Rung(value=f"{cells} cells, {size / 1e6:.2f} MB", bought=last, bytes=size - first_size))
+        if last:
             break
         fewer = max(_FEWEST, round(cells * (room / size) ** 0.5))
         exactly = {"observable": False, "voxel_pixels": 0.0, "clear_voxel_pixels": 0.0}
         config = with_cells(config, fewer).model_copy(update=exactly)
         traced = trace(config)
     if len(rungs) > 1:
-        cells = max(traced.observations.hull_grid.shape) - 1
         run.decide(
             Decision(
                 name="grids for the bytes",
                 basis="budget",
-                chosen=f"{cells} cells",
+                chosen=rungs[-1].value,
                 because=f"{room / 1e6:.2f} MB are left beside the background",
                 rungs=rungs,
             )

@@ -195,7 +195,9 @@ class SplashSplat(Method):
                 behind = completed(plates(), background)
             # What is shown on the way; the liquid is fitted before the plates, whether there was a draft or not.
             background = drafted or background
-        spent = within_seconds(scene, config, run)
+        if run.budget.limits and known is None:  # it is asked for by every trace on the way to the one that is kept
+            known = known_container(scene, config.container, config.container_masks)
+        spent = within_seconds(scene, config, run, known)
         config, settings = spent.config, config.background.model_copy(update=background_update(config, run))
 
         def trace(part: Run) -> Traced:

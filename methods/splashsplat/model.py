@@ -37,7 +37,8 @@ FORMAT = 5
 # Step in which values are stored where nothing is known of the photographs, of their spread.
 _UNKNOWN_STEP = 0.05
 _AGAIN = "fit the scene again"
-# The files, and what each is called where it is at fault.
+# Of a decoder, before it is made: a header may ask for any size.
+_WIDEST = 4096
 _FILES = ("carriers", "motion", "distance", "appearance")
 
 
@@ -186,9 +187,12 @@ class Liquid:
             # Models of before there was a choice do not say.
             between: BetweenFrames = "forward" if header.get("between_frames") == "forward" else "both"
             composition: Composition = "together" if header.get("composition") == "together" else "over"
-            decoder = Decoder(
-                DecoderSettings(**{key.replace("colour", "color"): value for key, value in header["decoder"].items()})
+            settings = DecoderSettings(
+                **{key.replace("colour", "color"): value for key, value in header["decoder"].items()}
             )
+            if not 1 <= max(settings.feature_size, settings.children, settings.color_width) <= _WIDEST:
+                raise ValueError(f"the decoder's sizes are not between 1 and {_WIDEST}")
+            decoder = Decoder(settings)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); {_AGAIN}") from None
         arrays: dict[str, dict[str, np.ndarray]] = {}
@@ -203,10 +207,11 @@ class Liquid:
             }
             arrays = {name: read_npz(directory / f"{name}.npz", ranks[name]) for name in _FILES}
             track = _fitting(directory, lambda: read_track(arrays, grid, times, factor))
-            look = _fitting(directory / "appearance.npz", lambda: read_appearance(arrays["appearance"], decoder, grid))
-            if len(look.features) != track.carriers.count:
-                others = f"{len(look.features)} carriers, not {track.carriers.count}"
+            count = len(arrays["appearance"]["coarseness"])
+            if count != track.carriers.count:
+                others = f"{count} carriers, not {track.carriers.count}"
                 raise SplashbenchError(f"{directory / 'appearance.npz'} has {others}; {_AGAIN}")
+            look = _fitting(directory / "appearance.npz", lambda: read_appearance(arrays["appearance"], decoder, grid))
         return cls._of_parts(times, track, look, carried, composition, between, arrays)
 
 

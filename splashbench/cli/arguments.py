@@ -120,6 +120,27 @@ def add_lpips_weights(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--lpips-weights", type=Path, metavar="FILE", help=".npz of LPIPS weights (AlexNet, v0.1)")
 
 
+def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) -> None:
+    """Add how the runs of a study are made. lost: what a run that takes too long has not; first: which come first."""
+    parser.add_argument(
+        "--timeout",
+        type=positive_number("minutes"),
+        metavar="MINUTES",
+        help=f"for each fit, and again for each rendering; a run that takes longer {lost}",
+    )
+    parser.add_argument(
+        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
+    )
+    parser.add_argument(
+        "--budget",
+        type=positive_number("minutes"),
+        metavar="MINUTES",
+        help=f"make runs as long as they end within so many minutes, {first}; the same command again goes on "
+        "(default: all runs)",
+    )
+    parser.add_argument("--retry", action="store_true", help="repeat failed runs")
+
+
 def add_run_options(parser: argparse._ActionsContainer) -> None:
     """Add what `run` and `run-external` have in common."""
     add_seed(parser)

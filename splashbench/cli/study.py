@@ -11,7 +11,13 @@ import shlex
 from pathlib import Path
 
 from splashbench.cli import study_capacity
-from splashbench.cli.arguments import add_lpips_weights, add_seeds, add_settings, positive_number, whole_number
+from splashbench.cli.arguments import (
+    add_lpips_weights,
+    add_seeds,
+    add_settings,
+    add_study_runs,
+    whole_number,
+)
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say
 
@@ -129,23 +135,7 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
         metavar="K",
         help="use each K-th timestep of the scenes; the frames between serve harm in milliseconds (default: 1)",
     )
-    parser.add_argument(
-        "--timeout",
-        type=positive_number("minutes"),
-        metavar="MINUTES",
-        help="for each fit, and again for each rendering; a run that takes longer keeps nothing",
-    )
-    parser.add_argument(
-        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
-    )
-    parser.add_argument(
-        "--budget",
-        type=positive_number("minutes"),
-        metavar="MINUTES",
-        help="make runs as long as they end within so many minutes, those first that say the most about where methods "
-        "break; the same command again goes on (default: all runs)",
-    )
-    parser.add_argument("--retry", action="store_true", help="repeat failed runs")
+    add_study_runs(parser, "keeps nothing", "those first that say the most about where methods break")
     add_lpips_weights(parser)
 
 

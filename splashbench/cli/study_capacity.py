@@ -11,8 +11,7 @@ from splashbench.cli.arguments import (
     add_method,
     add_seeds,
     add_settings,
-    positive_number,
-    whole_number,
+    add_study_runs,
 )
 from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, say
@@ -58,23 +57,7 @@ def register(actions: argparse._SubParsersAction) -> None:
     )
     add_settings(parser, "a setting of every rung", dest="base")
     add_seeds(parser, "of the method (default: 0)")
-    parser.add_argument(
-        "--timeout",
-        type=positive_number("minutes"),
-        metavar="MINUTES",
-        help="for each fit, and again for each rendering; a run that takes longer has no figures",
-    )
-    parser.add_argument(
-        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
-    )
-    parser.add_argument(
-        "--budget",
-        type=positive_number("minutes"),
-        metavar="MINUTES",
-        help="make runs as long as they end within so many minutes, the smallest rungs first; the same command again "
-        "goes on (default: all runs)",
-    )
-    parser.add_argument("--retry", action="store_true", help="repeat failed runs")
+    add_study_runs(parser, "has no figures", "the smallest rungs first")
     add_lpips_weights(parser)
 
 

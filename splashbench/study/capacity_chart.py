@@ -15,7 +15,7 @@ import pandas as pd
 from splashbench.score.metrics import METRICS
 from splashbench.score.notation import in_shown_unit, label
 from splashbench.study.capacity import MEAN
-from splashbench.study.chart import save_figure
+from splashbench.study.chart import STYLE, save_figure
 from splashbench.study.knee import Knee
 
 if TYPE_CHECKING:
@@ -29,14 +29,6 @@ _AXES = {
     "storage_bytes": "size of the model, MB",
     "fit_seconds": "fit time, s",
     "primitives_per_frame": "primitives in a frame",
-}
-_STYLE: dict[str, Any] = {
-    "svg.hashsalt": "splashbench",
-    "font.family": "DejaVu Sans",
-    "font.size": 8.5,
-    "text.parse_math": False,  # names come from files; a "$" in one is no formula
-    "axes.spines.top": False,
-    "axes.spines.right": False,
 }
 
 
@@ -62,7 +54,7 @@ def draw_capacity(
     from matplotlib.figure import Figure
 
     rows = ["psnr", "lpips" if frame["lpips"].notna().any() else "miou"]
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 6.9), layout="constrained")
         axes = figure.subplots(len(rows), len(_AXES), squeeze=False)
         for metric, places in zip(rows, axes):

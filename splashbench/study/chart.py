@@ -25,16 +25,16 @@ _BLUE, _VERMILION, _GREY = "#0072B2", "#D55E00", "#666666"
 _COLUMNS = 3
 # More do not fit over a panel in one line.
 _TITLE_LETTERS = 42
-_STYLE: dict[str, Any] = {
+#: Of the charts of all studies.
+STYLE: dict[str, Any] = {
     "svg.hashsalt": "splashbench",
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "text.parse_math": False,  # names come from files; a "$" in one is no formula
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.titlesize": 9,
-    "axes.titlelocation": "left",
 }
+_STYLE = STYLE | {"axes.titlesize": 9, "axes.titlelocation": "left"}
 
 
 def draw_chart(table: Table, out: Path) -> list[Path]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+#: Share of a limit by which a method may go over it.
+TOLERATED = 0.05
+
 
 class Budget(BaseModel):
     """Limits of a fit; None is no limit. A method that takes a budget keeps to it within 5 %, and may use less.

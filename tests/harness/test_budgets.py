@@ -60,6 +60,18 @@ def test_what_is_no_budget_is_a_usage_error(option: str, value: str, capsys: pyt
     assert option in capsys.readouterr().err
 
 
+def test_a_budget_that_was_not_kept_is_said(
+    thrifty: str, balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(seconds: str) -> str:
+        out = str(tmp_path / seconds)
+        main(["run", thrifty, str(balls_directory), out, "--budget-seconds", seconds, "--timing-frames=0"])
+        return capsys.readouterr().err
+
+    assert "a budget of 0.001 s could not be kept" in run("0.001")
+    assert "could not be kept" not in run("60")
+
+
 def test_limits_are_positive_and_finite() -> None:
     assert Budget().limits == {}
     assert Budget(seconds=2).limits == {"seconds": 2.0}

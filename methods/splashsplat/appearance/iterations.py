@@ -20,7 +20,7 @@ def iterations_decision(earned: Sequence[Earned], iterations: int) -> Decision:
         name="iterations",
         basis="withheld",
         chosen=f"{iterations} iterations",
-        because=f"learning rates stay up while withheld photographs gain more than the time is worth; {ended}",
+        because=f"there are more as long as withheld photographs gain more than the time is worth; {ended}",
         measure="PSNR of withheld photographs, dB",
         rungs=[
             Rung(

@@ -26,9 +26,12 @@ def repeated_frames(scene: TrainingScene, silhouettes: Silhouettes) -> np.ndarra
         repeated[t] = all(
             np.array_equal(silhouettes.mask(view, t), silhouettes.mask(view, t - 1))
             for view in range(len(silhouettes.views))
-        ) and all(_same(scene.image(name, t), scene.image(name, t - 1)) for name in silhouettes.views)
+        ) and all(_same(scene, name, t) for name in silhouettes.views)
     return repeated
 
 
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    return one.shape == other.shape and float(np.abs(one.astype(np.int16) - other).mean()) <= _SAME_LEVELS
+def _same(scene: TrainingScene, name: str, t: int) -> bool:
+    """Whether the liquid looks as it did. What lies around it stands still anyway, and would hide that it does not."""
+    mask = scene.mask(name, t)
+    now, before = scene.image(name, t)[mask], scene.image(name, t - 1)[mask]
+    return not mask.any() or float(np.abs(now.astype(np.int16) - before).mean()) <= _SAME_LEVELS

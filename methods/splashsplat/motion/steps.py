@@ -8,7 +8,7 @@ a jet's speed would spread from there to what splashes beside its foot. The pape
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -71,7 +71,3 @@ class Motion:
     def step(self, t: int) -> FrameStep:
         """From frame `t` to the next."""
         return FrameStep(self.velocities[t].astype(np.float32, copy=False), self.factor, self.falls[t])
-
-    def half(self) -> Motion:
-        """In the precision of the files."""
-        return replace(self, velocities=self.velocities.astype(np.float16))

@@ -65,9 +65,11 @@ def read_appearance(arrays: Mapping[str, np.ndarray], decoder: Decoder, grid: Gr
 
     Raises ValueError or RuntimeError where it does not fit together.
     """
-    values = read_values(StoredValues(**{name: arrays[name] for name in _VALUES}))
-    if values.shape[1] != decoder.settings.feature_size + _SCALES:
-        raise ValueError(f"{values.shape[1]} values of a carrier are not {decoder.settings.feature_size} + {_SCALES}")
+    stored = StoredValues(**{name: arrays[name] for name in _VALUES})
+    if len(stored.coefficients) != decoder.settings.feature_size + _SCALES:
+        size = len(stored.coefficients)
+        raise ValueError(f"{size} values of a carrier are not {decoder.settings.feature_size} + {_SCALES}")
+    values = read_values(stored)
     decoder.load_state_dict({name: torch.from_numpy(arrays[f"{_HEADS}{name}"]) for name in decoder.state_dict()})
     glass = None
     if f"{_GLASS}positions" in arrays:

@@ -24,6 +24,8 @@ from ..motion.velocity import factors
 POSITION_STEPS = 32
 #: The same for velocities, which are at most 8 voxels a frame (`velocity_limit`), and those of 16 bits.
 VELOCITY_STEPS, MAX_VELOCITY = 64, 32767
+#: Carriers of all frames together: a few kilobytes of zeros could ask for more than there is memory.
+MAX_ROWS = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,8 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
         raise ValueError("a carrier lasts beyond the last frame, or not at all")
     if int(lives.sum()) - count != len(stored.residuals):
         raise ValueError(f"{len(stored.residuals)} moves do not fit carriers with {int(lives.sum()) - count}")
+    if int(lives.sum()) > MAX_ROWS:
+        raise ValueError(f"{int(lives.sum())} rows are more than {MAX_ROWS}")
     cells = np.cumsum(stored.cells.astype(np.int64))
     if count and (cells.min() < 0 or cells.max() >= np.prod(grid.shape, dtype=np.int64)):
         raise ValueError("a carrier is born outside the grid")

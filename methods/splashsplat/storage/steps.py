@@ -68,7 +68,7 @@ class Storage:
             Rung(
                 value=f"{found.step:.3g}",
                 bought=found.step == step,
-                quality=found.against,
+                quality=found.against if math.isfinite(found.added) else None,
                 reason=f"adds {100 * found.added:.2g} % to the squared error",
             )
             for found in trials

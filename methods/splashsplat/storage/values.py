@@ -104,13 +104,16 @@ def read_values(stored: StoredValues) -> NDArray[np.float32]:
     if count and (stored.coarseness.min() < LEAST or stored.coarseness.max() > MOST):
         raise ValueError(f"coarseness is not between {LEAST} and {MOST}")
     values = np.zeros((count, size), dtype=np.float32)
-    for rows in _parts(count):
-        part = values[rows]
-        # Sums in one order, by single operations: the same floats on every machine.
-        for row, coefficients in zip(stored.basis, stored.coefficients):
-            part += coefficients[rows].astype(np.float32)[:, None] * row
-        part *= np.exp2(stored.coarseness[rows].astype(np.float32))[:, None]
-        part += stored.center
+    with np.errstate(over="ignore", invalid="ignore"):  # of files from strangers, which are refused below
+        for rows in _parts(count):
+            part = values[rows]
+            # Sums in one order, by single operations: the same floats on every machine.
+            for row, coefficients in zip(stored.basis, stored.coefficients):
+                part += coefficients[rows].astype(np.float32)[:, None] * row
+            part *= np.exp2(stored.coarseness[rows].astype(np.float32))[:, None]
+            part += stored.center
+    if not np.isfinite(values).all():
+        raise ValueError("values are beyond the range of float32")
     return values
 
 

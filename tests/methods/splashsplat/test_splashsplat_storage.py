@@ -127,6 +127,7 @@ def test_a_thousand_damages_raise_one_line_and_allocate_no_more_than_the_files_s
         ("distance", lambda a: a | {"phi": np.full_like(a["phi"], 100)}),
         ("appearance", lambda a: a | {"coefficients": a["coefficients"][:-1]}),
         ("appearance", lambda a: a | {"coarseness": a["coarseness"] + 100}),
+        ("appearance", lambda a: a | {"basis": np.full_like(a["basis"], 3e38)}),
     ],
 )
 def test_arrays_that_do_not_fit_together_are_named(
@@ -139,6 +140,28 @@ def test_arrays_that_do_not_fit_together_are_named(
     np.savez(path, **change(arrays))  # type: ignore[operator]
     with pytest.raises(SplashbenchError, match=r"does not fit|has \d+ carriers"):
         Liquid.load(tmp_path)
+
+
+def test_a_header_that_asks_for_a_huge_decoder_is_refused(
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path
+) -> None:
+    fitted[0].liquid.save(tmp_path)
+    header = json.loads((tmp_path / "liquid.json").read_text())
+    header["decoder"]["color_width"] = 10**9
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
+    with pytest.raises(SplashbenchError, match="decoder's sizes"):
+        Liquid.load(tmp_path)
+
+
+def test_more_rows_than_there_is_memory_for_are_refused(
+    fitted: tuple[FittedSplashSplat, Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    liquid = fitted[0].liquid
+    control = rows.whole_velocities(liquid.motion.velocities)
+    stored = rows.store_rows(liquid.carriers, control, liquid.motion, liquid.grid)
+    monkeypatch.setattr(rows, "MAX_ROWS", len(liquid.carriers.ids) - 1)
+    with pytest.raises(ValueError, match="rows are more than"):
+        rows.read_rows(stored, control, liquid.motion, liquid.phi, liquid.grid)
 
 
 def test_phi_is_stored_in_quarters_of_a_voxel_and_keeps_its_sign() -> None:
