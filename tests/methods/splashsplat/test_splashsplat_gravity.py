@@ -216,7 +216,6 @@ def test_motion_is_read_as_it_was_written():
     points = in_the_jet(np.array([0.15, 0.25]))
     np.testing.assert_allclose(again[1].velocity(points), FALL.velocity(points), rtol=1e-12)
     np.testing.assert_array_equal(again[1].holds(points), [True, True])
-    assert motion.half().velocities.dtype == np.float16
     with pytest.raises(ValueError, match="jets of shape"):
         falls_of(*table_of(motion.falls), GRID, np.array([0.0, 0.1]))
     rows, turn = table_of(motion.falls)
