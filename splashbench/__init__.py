@@ -15,15 +15,26 @@ from splashbench.version import __version__
 
 if TYPE_CHECKING:
     from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run, Support
-    from splashbench.scene import Camera, Particles, Scene, SignedDistance, TrainingScene
+    from splashbench.replay import Reconstruction, load
+    from splashbench.scene import (
+        Camera,
+        Gaussians,
+        Particles,
+        Scene,
+        SignedDistance,
+        TrainingScene,
+        VelocityField,
+    )
     from splashbench.submission import Submission
 
 __all__ = [
     "Camera",
     "Fitted",
+    "Gaussians",
     "Method",
     "MethodConfig",
     "Particles",
+    "Reconstruction",
     "Render",
     "Run",
     "Scene",
@@ -32,13 +43,18 @@ __all__ = [
     "Submission",
     "Support",
     "TrainingScene",
+    "VelocityField",
     "__version__",
+    "load",
 ]
 
 #: Module -> the names that are imported from it on demand.
 _MODULES = {
     "splashbench.harness.contract": ("Fitted", "Method", "MethodConfig", "Render", "Run", "Support"),
-    "splashbench.scene": ("Camera", "Particles", "Scene", "SignedDistance", "TrainingScene"),
+    "splashbench.replay": ("Reconstruction", "load"),
+    "splashbench.scene": (
+        *("Camera", "Gaussians", "Particles", "Scene", "SignedDistance", "TrainingScene", "VelocityField"),
+    ),
     "splashbench.submission": ("Submission",),
 }
 

@@ -42,8 +42,12 @@ class Background:
 
     def gaussians(self, camera: Camera) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Means [M, 3], factors [M, 3, 3], opacities [M] in (0, 1] and colors [M, 3] seen from `camera`, float32."""
+        return self.seen_from(camera.center)
+
+    def seen_from(self, eye: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """As `gaussians`, seen from `eye` [3] (scene units)."""
         with torch.no_grad(), one_torch_thread():
-            means, factors, opacities, colors, _ = (t.numpy() for t in self.model.decode(camera.center))
+            means, factors, opacities, colors, _ = (t.numpy() for t in self.model.decode(eye))
         drawn = opacities > 0
         return means[drawn], factors[drawn], opacities[drawn], colors[drawn]
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
-from splashbench.scene import Camera, Particles, TrainingScene
+from splashbench.scene import Camera, Gaussians, Particles, TrainingScene
 
 from .background import Background
 from .background_reuse import shared_background
@@ -27,6 +28,12 @@ class StaticScene(Fitted):
 
     def particles(self) -> Particles | None:
         return None
+
+    def static_gaussians(self, eye: NDArray) -> Gaussians:
+        return Gaussians(*self.background.seen_from(eye))
+
+    def empty_view(self, camera: Camera) -> NDArray[np.float32]:
+        return self.background.render(camera)
 
     def save(self, directory: Path) -> None:
         self.background.save(directory / "static")

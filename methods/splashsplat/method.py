@@ -15,9 +15,11 @@ from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Method, Render, Run, Support
 from splashbench.render import Frozen, freeze
 from splashbench.scene.camera import Camera
+from splashbench.scene.gaussians import Gaussians
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
+from splashbench.scene.velocity import VelocityField
 from splashbench.selfcalibration import self_calibration
 
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
@@ -74,27 +76,34 @@ class FittedSplashSplat(Fitted):
     @torch.no_grad()
     def _shown(self, camera: Camera, time: float) -> tuple[Children, tuple[torch.Tensor, torch.Tensor] | None] | None:
         """`children`, and what cuts them, see `LiquidOcclusion.cut`."""
-        parts = [
-            (self._decoded(camera, ids, state), state.positions.numpy().astype(np.float64))
-            for ids, state in carriers_at(self.liquid.track, self.liquid.times, time, self.liquid.between_frames)
-            if len(ids)
-        ]
+        parts = [(ids, self._seen(camera, state)) for ids, state in self._carriers(time)]
         if not parts:
             return None
-        shown, places = zip(*parts)
-        children = Children(*(torch.cat([getattr(part, f.name) for part in shown]) for f in fields(Children)))
-        cut = None if self.occlusion is None else self.occlusion.cut(camera, np.concatenate(places))
+        children = self._decoded(parts, camera.center)
+        places = np.concatenate([state.positions.numpy().astype(np.float64) for _, state in parts])
+        cut = None if self.occlusion is None else self.occlusion.cut(camera, places)
         return children, None if cut is None else (torch.from_numpy(cut[0]), torch.from_numpy(cut[1]))
 
-    def _decoded(self, camera: Camera, ids: torch.Tensor, state: CarrierState) -> Children:
-        if self.occlusion is not None:
-            seen = 1 - torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
-            state = replace(state, visibility=seen if state.visibility is None else seen * state.visibility)
+    def _carriers(self, time: float) -> list[tuple[torch.Tensor, CarrierState]]:
+        liquid = self.liquid
+        shown = carriers_at(liquid.track, liquid.times, time, liquid.between_frames)
+        return [(ids, state) for ids, state in shown if len(ids)]
+
+    def _seen(self, camera: Camera, state: CarrierState) -> CarrierState:
+        """`state` without what the container hides from `camera`."""
+        if self.occlusion is None:
+            return state
+        seen = 1 - torch.from_numpy(self.occlusion.hidden(camera, state.positions.numpy().astype(np.float64)))
+        return replace(state, visibility=seen if state.visibility is None else seen * state.visibility)
+
+    def _decoded(self, carriers: list[tuple[torch.Tensor, CarrierState]], eye: np.ndarray) -> Children:
         look = self.liquid.appearance
-        eye = torch.tensor(camera.center, dtype=torch.float32)
+        place = torch.tensor(eye, dtype=torch.float32)
         with one_torch_thread():
-            children, _ = look.decoder.decode(look.features, look.log_scales, ids, state, eye)
-        return children
+            parts = [
+                look.decoder.decode(look.features, look.log_scales, ids, state, place)[0] for ids, state in carriers
+            ]
+        return Children(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Children)))
 
     @torch.no_grad()
     def render(self, camera: Camera, time: float) -> Render:
@@ -123,6 +132,32 @@ class FittedSplashSplat(Fitted):
     def signed_distance(self) -> SignedDistance | None:
         """phi of every frame, as the carriers were held to it."""
         return self.liquid.signed_distance()
+
+    def surface(self, time: float) -> SignedDistance | None:
+        """phi at `time`: the two frames' around it, moved there by u_t and blended."""
+        return self.liquid.surface(time)
+
+    @torch.no_grad()
+    def gaussians(self, time: float, eye: np.ndarray) -> Gaussians:
+        """The carriers' children, coloured as `eye` [3] sees them; what the container hides is among them."""
+        carriers = self._carriers(time)
+        if not carriers:
+            return Gaussians.none()
+        children = self._decoded(carriers, eye)
+        parts = (children.means, children.factors, children.opacities, children.colors)
+        return Gaussians(*(part.flatten(0, 1).numpy() for part in parts))
+
+    def static_gaussians(self, eye: np.ndarray) -> Gaussians:
+        """The frozen background's, coloured as `eye` [3] sees them."""
+        return Gaussians(*self.background.seen_from(eye))
+
+    def empty_view(self, camera: Camera) -> np.ndarray:
+        """The frozen background as `camera` sees it."""
+        return self._background(camera).copy()
+
+    def velocity(self, time: float) -> VelocityField | None:
+        """u_t of the step that `time` lies in; None where others than u_t moved the carriers."""
+        return self.liquid.velocity(time)
 
     def save(self, directory: Path) -> None:
         """The liquid's files, and the background under static/."""

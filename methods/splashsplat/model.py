@@ -18,13 +18,15 @@ from splashbench.files import compressed_bytes, read_json, read_npz, write_json,
 from splashbench.observe.grid import Grid
 from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles
+from splashbench.scene.velocity import VelocityField
 
 from .appearance.decoder import Decoder, DecoderSettings
 from .appearance.fitting import Appearance, Composition
 from .appearance.sensitivity import Sensitivity
 from .carriers.between import BetweenFrames
 from .carriers.population import Carriers
-from .carriers.subframe import Track
+from .carriers.subframe import Track, locate
+from .motion.between import moved_distance
 from .motion.steps import Motion
 from .motion.velocity import Factor
 from .storage.earlier import EARLIER, read_earlier
@@ -39,6 +41,8 @@ _UNKNOWN_STEP = 0.05
 _AGAIN = "fit the scene again"
 # Of a decoder, before it is made: a header may ask for any size.
 _WIDEST = 4096
+# Nodes of the transport grid between those of a velocity field that is handed out: u_t is coarser still.
+_NODES_APART = 2
 _FILES = ("carriers", "motion", "distance", "appearance")
 
 
@@ -142,6 +146,27 @@ class Liquid:
     def signed_distance(self) -> SignedDistance | None:
         """phi_t of every frame on the transport grid; None where that is more than a submission may hold."""
         return None if self.phi.nbytes > MAX_BYTES else SignedDistance(self.phi, self.grid.origin, self.grid.voxel)
+
+    def surface(self, time: float) -> SignedDistance:
+        """phi at `time` (seconds), one instant: each frame's around it moved there by u_t, blended by nearness."""
+        t, fraction = locate(self.times, time)
+        phi = self.phi[t : t + 1]
+        if fraction != 0:
+            first, share = (t, fraction) if fraction > 0 else (t - 1, 1 + fraction)
+            phi = moved_distance(self.phi[first], self.phi[first + 1], self.motion.step(first), share)[None]
+        return SignedDistance(phi, self.grid.origin, self.grid.voxel)
+
+    def velocity(self, time: float) -> VelocityField | None:
+        """u_t of the step that `time` (seconds) lies in, on every second node; None where it moved no carrier."""
+        if not self.carried or len(self.times) < 2:
+            return None
+        t = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
+        nodes = np.stack(np.meshgrid(*(np.arange(0, n, _NODES_APART) for n in self.grid.shape), indexing="ij"), -1)
+        per_second = self.grid.voxel / (self.times[t + 1] - self.times[t])
+        values = self.motion.step(t).velocity(nodes.reshape(-1, 3).astype(np.float64)) * per_second
+        liquid = self.surface(time).phi[0, ::_NODES_APART, ::_NODES_APART, ::_NODES_APART] < 0
+        spacing = np.full(3, self.grid.voxel * _NODES_APART)
+        return VelocityField(values.reshape(nodes.shape), self.grid.origin, spacing, liquid)
 
     @property
     def stored_bytes(self) -> int:

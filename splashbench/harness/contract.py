@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from splashbench.errors import SplashbenchError
 from splashbench.harness.checkpoints import Checkpoints
-from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+from splashbench.scene import Camera, Gaussians, Particles, SignedDistance, TrainingScene, VelocityField
 from splashbench.submission.budget import Budget
 from splashbench.submission.decisions import MAX_DECISIONS, Decision
 from splashbench.submission.decisions import MAX_RUNGS as MAX_RUNGS
@@ -278,6 +278,33 @@ class Fitted(ABC):
 
         It says where the liquid is, its inside included. Without one, scoring derives it from the particles.
         """
+        return None
+
+    def surface(self, time: float) -> SignedDistance | None:
+        """The liquid's signed distance at `time` alone (one instant), or None for a method without one.
+
+        Without it, viewers and exports blend the distances of the two timesteps around `time`, which loses what moves
+        by more than its own size.
+        """
+        return None
+
+    def gaussians(self, time: float, eye: NDArray) -> Gaussians | None:
+        """The liquid's Gaussians at `time`, coloured as they are seen from `eye` [3] (scene units); None without any.
+
+        What a container hides from `eye` is among them: whoever asks looks from elsewhere next.
+        """
+        return None
+
+    def static_gaussians(self, eye: NDArray) -> Gaussians | None:
+        """The Gaussians of a background that never changes, seen from `eye` [3]; None where it is not apart."""
+        return None
+
+    def empty_view(self, camera: Camera) -> NDArray[np.float32] | None:
+        """What `camera` would see without liquid, float32 [H, W, 3], sRGB in [0, 1]; None where it is not known."""
+        return None
+
+    def velocity(self, time: float) -> VelocityField | None:
+        """How fast the liquid moves at `time`, or None for a method whose motion is not that of a liquid."""
         return None
 
     @abstractmethod

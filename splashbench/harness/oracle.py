@@ -17,6 +17,7 @@ from splashbench.harness import hardware
 from splashbench.progress import track
 from splashbench.scene import Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Submission, seal, write_view
+from splashbench.submission.cameras import write_cameras
 from splashbench.version import __version__
 
 
@@ -53,5 +54,6 @@ def write_oracle(
             hardware=hardware.describe(),
         )
         count = float(particles.active.sum(axis=1).mean()) if particles is not None else None
+        write_cameras(staging, scene)
         seal(staging, identity, Record(particles_per_frame=count))
     return Submission.open(out)

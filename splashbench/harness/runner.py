@@ -34,6 +34,7 @@ from splashbench.submission import (
     identity_text,
     seal,
 )
+from splashbench.submission.cameras import write_cameras
 from splashbench.submission.withheld import Withheld, kept_timesteps, scored_timesteps
 from splashbench.version import __version__
 
@@ -147,6 +148,7 @@ def run_method(
         )
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, method.id)
+        write_cameras(staging, scene, kept_timesteps(scene.n_frames, withheld))
         seal(staging, identity, record)
     return Submission.open(out)
 

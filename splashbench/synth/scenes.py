@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.dyes import Dye, dye_named
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.files.ply import write_mesh
@@ -138,11 +139,13 @@ def make_scene(
     seed: int = 0,
     particle_radius: float | None = None,
     step_ms: float | None = None,
+    dye: str | None = None,
     replace_existing: bool = False,
 ) -> Scene:
     """Make the scene `name` of `RECIPES` in the new folder `out`, with `timesteps` frames of `size` (width, height).
 
-    `particle_radius` in metres replaces the recipe's own; `step_ms` milliseconds between all frames, its time steps.
+    `particle_radius` in metres replaces the recipe's own; `step_ms` milliseconds between all frames, its time steps;
+    `dye`, a name or color as `dye_named` takes it, the liquid's. Two scenes that differ by it alone show one pour.
     Raises SplashbenchError for an unknown name, for frames that last too long, or when the liquid solver cannot run.
     """
     if name not in RECIPES:
@@ -152,6 +155,7 @@ def make_scene(
     if step_ms is not None and not 0 < step_ms < np.inf:
         raise SplashbenchError(f"--step {step_ms:g} will not do; give milliseconds above 0")
     recipe = RECIPES[name]
+    dyed = None if dye is None else dye_named(dye)
     shown = recipe.times(timesteps, step_ms)
     if shown[-1] - shown[0] > _LONGEST_SECONDS:
         raise SplashbenchError(
@@ -177,7 +181,7 @@ def make_scene(
             trajectory = running.finish()
         finally:
             running.stop()
-        room = TracedRoom(recipe.container.room(seed))
+        room = TracedRoom(_with_dye(recipe.container.room(seed), dyed))
         views = {camera: RoomView(room, lens, samples=1) for camera, lens in lenses.items()}
         write_scene(
             staging,
@@ -187,7 +191,7 @@ def make_scene(
             n_frames=timesteps,
             frames=_frames(room, lenses, trajectory, shown, pour.particle_radius, seed),
             meta=SceneMeta(
-                name=f"synthetic_{name}",
+                name=f"synthetic_{name}" + ("" if dye is None else f"_{dye.lstrip('#')}"),
                 times=(shown - shown[0]).tolist(),
                 metres_per_unit=1.0,
                 gravity=GRAVITY,
@@ -199,6 +203,7 @@ def make_scene(
                     "recipe": recipe.title,
                     "seed": seed,
                     "particle_radius": radius,
+                    **({} if dye is None else {"dye": dye}),
                 },
             ),
             initial_points=_initial_points([views[camera] for camera in TRAIN], seed),
@@ -209,6 +214,10 @@ def make_scene(
         container = recipe.container.mesh()
         write_mesh(staging / "truth" / "container.ply", container.vertices, container.faces)
     return Scene.open(out)
+
+
+def _with_dye(room: CaptureRoom, dye: Dye | None) -> CaptureRoom:
+    return room if dye is None else replace(room, dye=replace(room.dye, albedo=dye.albedo, absorption=dye.absorption))
 
 
 def _pinhole(camera: LensCamera) -> LensCamera:

@@ -15,6 +15,7 @@ examples:
   splashbench synth scene balls scenes/balls                 takes a second: to try a method on
   splashbench synth scene opaque_bowl scenes/opaque_bowl     takes minutes: a simulated pour
   splashbench synth scene glass_tank scenes/tank --step 33 --timesteps 20
+  splashbench synth scene glass_tank scenes/amber --dye amber     the same pour, of another colour
 
 scenes, and the time between their frames:
   balls         balls in free flight, 8 frames within a third of a second
@@ -61,6 +62,11 @@ def register(actions: argparse._SubParsersAction) -> None:
         metavar="METRES",
         help="radius of the simulated particles (default: depends on the scene)",
     )
+    parser.add_argument(
+        "--dye",
+        metavar="DYE",
+        help="colour of the liquid: amber, brown, green, blue, clear or '#rrggbb' (default: depends on the scene)",
+    )
     add_seed(parser, "decides poses, lenses and noise")
     add_replace(parser)
 
@@ -68,7 +74,11 @@ def register(actions: argparse._SubParsersAction) -> None:
 def make(arguments: argparse.Namespace) -> int:
     """Handle `splashbench synth scene`."""
     if arguments.name == _BALLS:
-        for option, value in (("--step", arguments.step), ("--particle-radius", arguments.particle_radius)):
+        for option, value in (
+            ("--step", arguments.step),
+            ("--particle-radius", arguments.particle_radius),
+            ("--dye", arguments.dye),
+        ):
             if value is not None:
                 raise SplashbenchError(f"{option} is for simulated scenes, and balls is not one; leave it out")
         from splashbench.synth.balls import write_balls_scene
@@ -91,6 +101,7 @@ def make(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             particle_radius=arguments.particle_radius,
             step_ms=arguments.step,
+            dye=arguments.dye,
             replace_existing=arguments.replace,
         )
     if arguments.json:

@@ -25,6 +25,7 @@ from splashbench.harness.runner import TIMING_FRAMES, drop_unwanted, require_unc
 from splashbench.scene import Scene
 from splashbench.scene.export import InitialPoints
 from splashbench.submission import IDENTITY, Identity, Submission, identity_text, seal
+from splashbench.submission.cameras import write_cameras
 from splashbench.version import __version__
 
 #: What a submission calls the settings that are in its commands.
@@ -86,6 +87,7 @@ def run_external(
             record = run.record.model_copy(update=fault)
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, code.name)
+        write_cameras(staging, scene)
         seal(staging, identity, record)
     return Submission.open(out)
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.dyes import DYES
 from splashbench.synth.imaging.geometry import (
     BASIN,
     BOWL,
@@ -25,7 +26,7 @@ from splashbench.synth.imaging.geometry import (
     dish_mesh,
     tank_mesh,
 )
-from splashbench.synth.imaging.shading import BLUE, DAYLIGHT, Dye, Glaze, Light, light_from
+from splashbench.synth.imaging.shading import BLUE, DAYLIGHT, Glaze, Light, PouredDye, light_from
 from splashbench.synth.imaging.texture import Albedo, Color, banded, board_albedo, mottled, printed
 
 Array = NDArray[np.float64]
@@ -60,8 +61,8 @@ _BLUE_LINEN = Surfaces((0.37, 0.43, 0.50), 0.18, (0.45, 0.42, 0.44), 0.22, strea
 _LAMP = light_from((-0.50, 0.78, 0.38), (0.72, 0.63, 0.50), (0.52, 0.55, 0.60), (0.55, 0.55, 0.62))
 _OVERCAST = light_from((0.20, 0.90, 0.38), (0.42, 0.43, 0.45), (0.72, 0.74, 0.78), (-0.30, 0.75, 0.59))
 
-_CRIMSON = Dye(np.array([0.46, 0.045, 0.05], np.float32), np.array([8.0, 60.0, 50.0], np.float32))
-_AMBER = Dye(np.array([0.34, 0.17, 0.04], np.float32), np.array([6.0, 22.0, 55.0], np.float32), tints_shadow=True)
+_CRIMSON = PouredDye(np.array([0.46, 0.045, 0.05], np.float32), np.array([8.0, 60.0, 50.0], np.float32))
+_AMBER = PouredDye(DYES["amber"].albedo, DYES["amber"].absorption, tints_shadow=True)
 _TEAL_GLAZE = (0.07, 0.17, 0.18)
 
 
@@ -87,7 +88,7 @@ class CaptureRoom:
     bowl_texture: Albedo | None = None
     glaze: Glaze | None = None
     light: Light = DAYLIGHT
-    dye: Dye = BLUE
+    dye: PouredDye = BLUE
 
 
 @lru_cache(maxsize=1)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.dyes import DYES, Dye
 from splashbench.synth.imaging.geometry import BowlShape
 
 Vectors = NDArray[np.float32]
@@ -33,15 +34,13 @@ class Light:
 
 
 @dataclass(frozen=True, eq=False)
-class Dye:
-    """A liquid's colour: its `albedo` [3] where it is opaque, `absorption` [3] per metre of r, g, b where it is clear.
+class PouredDye(Dye):
+    """A liquid's colour: its `albedo` where it is opaque, its `absorption` where it is clear.
 
     Attributes:
         tints_shadow: its shadow is the light that comes through it; without, no light does.
     """
 
-    albedo: NDArray[np.float32]
-    absorption: NDArray[np.float32]
     tints_shadow: bool = False
 
 
@@ -53,7 +52,7 @@ def light_from(towards: Color, key: Color | float, sky: Color | float, window: C
 
 
 DAYLIGHT = light_from((0.42, 0.80, 0.43), 0.62, 0.62, (-0.50, 0.62, 0.60))
-BLUE = Dye(np.array([0.035, 0.13, 0.50], np.float32), np.array([70.0, 30.0, 9.0], np.float32))
+BLUE = PouredDye(DYES["blue"].albedo, DYES["blue"].absorption)
 
 
 def ambient(normal: Vectors, light: Light) -> NDArray[np.float32]:
@@ -114,7 +113,7 @@ def wet(
     lit: NDArray[np.bool_],
     openness: NDArray[np.float32],
     behind: Behind | None = None,
-    dye: Dye = BLUE,
+    dye: PouredDye = BLUE,
     light: Light = DAYLIGHT,
 ) -> Vectors:
     """Dyed liquid seen along unit `view` directions: diffuse dye, Fresnel mirror of the room, and a highlight.

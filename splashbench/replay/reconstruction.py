@@ -1,0 +1,197 @@
+"""A fitted reconstruction: the model that a submission keeps, its cameras and its times."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Fitted, Render
+from splashbench.harness.discovery import load_method, registered
+from splashbench.harness.training_copy import make_training_copy
+from splashbench.replay.stored_views import StoredViews
+from splashbench.scene import Camera, Gaussians, Particles, Scene, SignedDistance, TrainingScene, VelocityField
+from splashbench.submission import Status, Submission
+from splashbench.submission.cameras import CAMERAS, read_cameras
+from splashbench.submission.withheld import kept_timesteps
+
+_NO_MODEL = "keeps no model; run the method again, without --no-model"
+
+
+class Reconstruction:
+    """A liquid that was reconstructed. Use `splashbench.load`.
+
+    Attributes:
+        submission: what it was read from. name: of the method, as in charts.
+        scene: the Scene where it was given, else None: then there are no photographs to compare with.
+        cameras: name -> Camera, training cameras first. train, test: their names.
+        times: [T] seconds, the timesteps that the method saw.
+        fitted: the method's model, or the stored views where no model is kept.
+    """
+
+    def __init__(
+        self, submission: Submission, fitted: Fitted, known: TrainingScene, scene: Scene | None, scratch: object = None
+    ) -> None:
+        self.submission, self.fitted, self.scene = submission, fitted, scene
+        self.name = submission.identity.method
+        self.train, self.test = tuple(known.train), tuple(known.test)
+        self.cameras: dict[str, Camera] = {**known.cameras, **known.test_cameras}
+        self.times: NDArray[np.float64] = known.times
+        self.camera_times = known.camera_times
+        self.gravity, self.metres_per_unit = known.gravity, known.metres_per_unit
+        self._known, self._scratch = known, scratch
+
+    def __repr__(self) -> str:
+        identity = self.submission.identity
+        span = f"{len(self.times)} timesteps in {self.times[-1] - self.times[0]:.3g} s"
+        cameras = f"{len(self.train)} training and {len(self.test)} test cameras"
+        return f"<Reconstruction {identity.method} ({identity.preset}) of {identity.scene}: {span}, {cameras}>"
+
+    @property
+    def has_model(self) -> bool:
+        """Whether it can be rendered from anywhere; else there are the submission's own views alone."""
+        return not isinstance(self.fitted, StoredViews)
+
+    def camera(self, name: str) -> Camera:
+        """The scene's camera `name`. Raises SplashbenchError where there is none."""
+        if name not in self.cameras:
+            raise SplashbenchError(f"there is no camera {name[:40]!r}; choose one of {', '.join(self.cameras)}")
+        return self.cameras[name]
+
+    def render(self, camera: Camera | str, time: float) -> Render:
+        """The view of `camera`, one of the scene's by name or any other, at `time` in seconds.
+
+        Any time within the recording will do, between timesteps too; beyond it the first or last timestep is shown.
+        Without a model, only test cameras by name at timesteps: anything else raises SplashbenchError.
+        """
+        return self.fitted.render(self.camera(camera) if isinstance(camera, str) else camera, float(time))
+
+    def empty_view(self, camera: Camera | str) -> NDArray[np.float32] | None:
+        """What the view would be without liquid, float32 [H, W, 3], sRGB in [0, 1]; None where that is not known."""
+        return self.fitted.empty_view(self.camera(camera) if isinstance(camera, str) else camera)
+
+    def gaussians(self, time: float, eye: NDArray | None = None) -> Gaussians | None:
+        """The liquid's Gaussians at `time`, coloured as seen from `eye` [3] (scene units; the cameras' mean place)."""
+        return self.fitted.gaussians(float(time), self.eye if eye is None else np.asarray(eye, dtype=np.float64))
+
+    def static_gaussians(self, eye: NDArray | None = None) -> Gaussians | None:
+        """The background's Gaussians, as `gaussians`; None where the method keeps no background apart."""
+        return self.fitted.static_gaussians(self.eye if eye is None else np.asarray(eye, dtype=np.float64))
+
+    @cached_property
+    def eye(self) -> NDArray[np.float64]:
+        """The mean place of the training cameras [3], scene units."""
+        return np.asarray(np.mean([self.cameras[name].center for name in self.train], axis=0))
+
+    @cached_property
+    def _particles(self) -> Particles | None:
+        return self.submission.particles()
+
+    def particles(self) -> Particles | None:
+        """The method's particles on the timesteps, or None."""
+        return self._particles
+
+    @cached_property
+    def _distances(self) -> SignedDistance | None:
+        return self.submission.geometry()
+
+    def surface(self, time: float) -> SignedDistance | None:
+        """The liquid's signed distance at `time` (one instant), or None for a method that hands in none.
+
+        Between timesteps it is the method's own, else the mean of the two around, weighted by nearness.
+        """
+        made = self.fitted.surface(float(time))
+        if made is not None:
+            return made
+        distances = self._distances
+        if distances is None:
+            return None
+        if len(self.times) == 1 or distances.n_frames != len(self.times):
+            t, share = int(np.abs(self.times - time).argmin()), 0.0
+        else:
+            inside = float(np.clip(time, self.times[0], self.times[-1]))
+            t = int(np.clip(np.searchsorted(self.times, inside, side="right") - 1, 0, len(self.times) - 2))
+            share = (inside - self.times[t]) / (self.times[t + 1] - self.times[t])
+        if share < 1e-6:
+            return SignedDistance(distances.phi[t : t + 1], distances.origin, distances.voxel)
+        blended = (1 - share) * distances.phi[t].astype(np.float32) + share * distances.phi[t + 1]
+        steps = np.rint(blended).astype(np.int8)
+        steps[(steps == 0) & (blended < 0)] = -1
+        return SignedDistance(steps[None], distances.origin, distances.voxel)
+
+    def velocity(self, time: float) -> VelocityField | None:
+        """The liquid's velocity at `time` on a grid, or None for a method without one."""
+        return self.fitted.velocity(float(time))
+
+
+def load(
+    submission: Path | str, scene: Path | str | None = None, verify: bool = True, method: str | None = None
+) -> Reconstruction:
+    """Open what `splashbench run` wrote, to be rendered from anywhere at any time.
+
+    Args:
+        submission: its folder.
+        scene: the scene's folder. Methods whose opacity of the liquid comes from masks need it, and so do photographs
+            to compare with; for splashsplat it may be left out.
+        verify: whether files must have the digests that SHA256SUMS states.
+        method: `FILE.py:CLASS` of a method that is not installed, which runs its code.
+
+    Example: `splashbench.load("submissions/bowl").render("3", time=0.25).rgb` is an image [H, W, 3] in [0, 1].
+
+    Raises SplashbenchError for a folder that is no submission, a run that failed, a method that is not installed, a
+    scene that is another, or files that are damaged.
+    """
+    opened = Submission.open(Path(submission), verify=verify)
+    identity = opened.identity
+    if opened.status != Status.OK:
+        raise SplashbenchError(
+            f"{submission} is of a run that ended with status {opened.status.value}; nothing to show"
+        )
+    whole = None if scene is None else Scene.open(Path(scene))
+    if whole is not None and whole.digest != identity.scene_digest:
+        raise SplashbenchError(
+            f"{submission} was made for another version of scene {identity.scene} than {scene}; give the scene it was "
+            "run on"
+        )
+    known, scratch = _known_scene(opened, whole)
+    model = opened.directory / "model"
+    if not model.is_dir():
+        return Reconstruction(opened, StoredViews(opened, known, _NO_MODEL), known, whole)
+    if method is None and identity.method not in registered():
+        remedy = f"is of method {identity.method}, which is not installed here; install it to see other views"
+        return Reconstruction(opened, StoredViews(opened, known, remedy), known, whole)
+    loader = load_method(method or identity.method)
+    if loader.id != identity.method:
+        raise SplashbenchError(
+            f"{submission} is of method {identity.method}, and {method} is {loader.id}; give its own"
+        )
+    try:
+        fitted = loader.load(model, known)
+    except SplashbenchError:
+        raise
+    except Exception as error:
+        said = f"{type(error).__name__}: {error}"
+        raise SplashbenchError(f"{model} cannot be loaded by {loader.id} {loader.version} ({said})") from error
+    return Reconstruction(opened, fitted, known, whole, scratch)
+
+
+def _known_scene(submission: Submission, scene: Scene | None) -> tuple[TrainingScene, object]:
+    """What the method is told when its model is loaded, and what has to live as long as it."""
+    identity = submission.identity
+    if scene is not None and identity.withheld is None:
+        return scene.training(), None
+    if scene is not None:
+        scratch = tempfile.TemporaryDirectory(prefix="splashbench-")
+        kept = kept_timesteps(scene.n_frames, identity.withheld)
+        return Scene.open(make_training_copy(scene, Path(scratch.name, "scene"), kept)).training(), scratch
+    absent = read_cameras(submission.directory)
+    if absent is None:
+        raise SplashbenchError(
+            f"{submission.directory} has no {CAMERAS}, as it was written by an earlier version; give its scene "
+            "(--scene, or scene=...)"
+        )
+    return absent, None
