@@ -6,7 +6,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 
-from splashbench.harness.discovery import load_method
+import splashbench
 from splashbench.harness.runner import run_method
 from splashbench.scene import Camera, Scene
 from splashbench.submission import to_8bit
@@ -32,8 +32,7 @@ def main(out: Path, frames: int = 48, size: tuple[int, int] = (192, 128)) -> Pat
     if submission.status != "ok":
         raise SystemExit(f"{submission.status.value}: {submission.reason}")
 
-    # The model is loaded as the harness does it: from OUT/model, with the scene as a method may see it.
-    model = load_method("hull_points").load(submission.directory / "model", scene.training())
+    model = splashbench.load(submission.directory, scene=directory)
     camera = scene.cameras[scene.train[len(scene.train) // 2]]
     target = submission.particles().at(scene.n_frames // 2).mean(axis=0)
     angles = np.radians(40) * np.sin(np.linspace(0, 2 * np.pi, frames))

@@ -1,8 +1,8 @@
-"""The one entry of child processes: `python -m splashbench.child PARENT MODULE:FUNCTION ARGUMENT...`.
+"""The one entry of child processes: a task, MODULE:FUNCTION, with its arguments.
 
 A task is a function of the room that needs the process. It takes its arguments as text and returns the exit code. What
-all children share is here: they end with the process that started them, and report a full disk by an exit code of its
-own. Nothing heavy is imported, since an external code's time runs already.
+all children share is here: they import from where their parent did and from nowhere else, end with it, and report a
+full disk by an exit code of its own. Nothing heavy is imported, since an external code's time runs already.
 """
 
 from __future__ import annotations
@@ -16,6 +16,12 @@ from pathlib import Path
 from splashbench.errors import DiskFullError
 from splashbench.processes import end_with_parent
 
+# With `python -m` and `python -c` the current folder comes first among those that are imported from, and a downloaded
+# one may hold a json.py. So the parent's folders are set before anything is imported.
+_START = (
+    "import sys; sys.path[:] = sys.argv[1].split({separator!r}); del sys.argv[1]; "
+    "from splashbench.child import main; sys.exit(main(*sys.argv[1:]))"
+)
 #: Exit code of a child that could not write; the last line of its log says which file.
 DISK_FULL_EXIT = 28
 
@@ -23,7 +29,9 @@ DISK_FULL_EXIT = 28
 def child_command(task: Callable[..., int], *arguments: str | Path) -> list[str]:
     """The command line of a child process of this one that carries out `task(*arguments)`."""
     name = f"{task.__module__}:{task.__qualname__}"
-    return [sys.executable, "-m", "splashbench.child", str(os.getpid()), name, *map(str, arguments)]
+    folders = os.pathsep.join(folder for folder in sys.path if folder)  # "" would be wherever the child is
+    start = [sys.executable, "-c", _START.format(separator=os.pathsep), folders]
+    return [*start, str(os.getpid()), name, *map(str, arguments)]
 
 
 def raise_if_disk_was_full(exit_code: int | None, log: Sequence[str]) -> None:
@@ -42,7 +50,3 @@ def main(parent: str, task: str, *arguments: str) -> int:
         print(error, file=sys.stderr)
         return DISK_FULL_EXIT
     return exit_code
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.srgb import to_linear
 
 _HEX = re.compile(r"#[0-9a-fA-F]{6}")
 # Of a channel that a colour lacks altogether a dye would absorb infinitely much.
@@ -66,7 +67,6 @@ def dye_named(name: str) -> Dye:
         raise SplashbenchError(
             f"there is no dye {name[:40]!r}; choose one of {', '.join(DYES)}, or give a color as '#rrggbb'"
         )
-    srgb = np.array([int(name[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = to_linear(np.array([int(name[i : i + 2], 16) for i in (1, 3, 5)]) / 255)
     kept = np.clip(linear, _DARKEST, _LIGHTEST)
     return Dye((_RETURNED * linear).astype(np.float32), (-np.log(kept) / REFERENCE_METRES).astype(np.float32))

@@ -60,6 +60,13 @@ class Bar:
             self._last_line = time.monotonic()
             print(f"{self._description}: {fraction:4.0%} {message}".rstrip(), file=sys.stderr, flush=True)
 
+    def hold(self, message: str) -> None:
+        """Show at once why the bar stands still."""
+        if self._bar is not None:
+            self._bar.set_postfix_str(message[:40])
+        else:
+            print(f"{self._description}: {message}", file=sys.stderr, flush=True)
+
     def close(self) -> None:
         """Leave the bar as it stands and end its line."""
         if self._bar is not None:

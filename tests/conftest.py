@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from splashbench.scene import Scene
 from splashbench.synth.balls import write_balls_scene
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What a developer has fetched once, such as LPIPS weights, changes no test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPLASHBENCH_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

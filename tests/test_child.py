@@ -27,9 +27,10 @@ def full(path):
 
 def _child(tmp_path: Path, parent: int, *words: str) -> subprocess.CompletedProcess[str]:
     (tmp_path / "tasks.py").write_text(TASKS)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-m", "splashbench.child", str(parent), *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(tmp_path))
+        start = child_command(method_process.carry_out)[:-2]
+    return subprocess.run([*start, str(parent), *words], capture_output=True, text=True)
 
 
 def test_a_task_gets_its_arguments_as_text_and_gives_the_exit_code(tmp_path: Path) -> None:
@@ -55,7 +56,33 @@ def test_a_child_whose_parent_is_gone_does_nothing(tmp_path: Path) -> None:
 
 def test_a_command_names_task_and_parent() -> None:
     words = child_command(method_process.carry_out, Path("request.json"))
-    assert words[1:] == [
-        *("-m", "splashbench.child", str(os.getpid())),
-        *("splashbench.harness.method_process:carry_out", "request.json"),
-    ]
+    assert words[-3:] == [str(os.getpid()), "splashbench.harness.method_process:carry_out", "request.json"]
+
+
+def test_code_in_the_folder_one_stands_in_is_not_run(tmp_path: Path) -> None:
+    folder = tmp_path / "downloaded"
+    folder.mkdir()
+    for module in ("json", "numpy", "pydantic", "splashbench"):
+        (folder / f"{module}.py").write_text("open('ran', 'w').close()\n")
+    start = child_command(method_process.carry_out)[:-2]
+    done = subprocess.run(
+        [*start, str(os.getpid()), "splashbench.harness.method_process:carry_out", "nothing.json"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    assert not (folder / "ran").exists()
+    assert done.returncode != 0
+    assert "nothing.json" in done.stderr
+
+
+def test_a_run_in_a_strangers_folder_runs_none_of_its_code(balls_directory: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "downloaded"
+    folder.mkdir()
+    (folder / "json.py").write_text("open('ran', 'w').close()\nraise SystemExit(7)\n")
+    tool = Path(sys.executable).with_name("splashbench")
+    words = [str(tool), "run", "nearest_camera", str(balls_directory), str(tmp_path / "out")]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "ok" in done.stderr + done.stdout
+    assert not (folder / "ran").exists()

@@ -44,6 +44,18 @@ def test_a_fraction_reported_from_elsewhere_gets_lines_too(capsys: pytest.Captur
     assert capsys.readouterr().err.splitlines() == ["fit:  25% 1.2 dB"]
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+def test_why_a_bar_stands_still_is_shown_at_once(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    bar = Bar("fetch")
+    bar.update(0.5)
+    bar.hold("again in 2 s")
+    assert "again in 2 s" in capsys.readouterr().err
+    bar.close()
+
+
 def test_a_bar_never_goes_backwards(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     bar = Bar("fit")

@@ -6,9 +6,9 @@ import sys
 import pytest
 
 import splashbench
-from splashbench import errors, submission
+from splashbench import errors, replay, submission
 from splashbench.harness import contract
-from splashbench.scene import Camera, Particles, Scene, SignedDistance, TrainingScene
+from splashbench.scene import Camera, Gaussians, Particles, Scene, SignedDistance, TrainingScene, VelocityField
 
 
 def test_each_name_is_the_one_of_its_room() -> None:
@@ -16,7 +16,8 @@ def test_each_name_is_the_one_of_its_room() -> None:
         "SplashbenchError": errors.SplashbenchError,
         "Submission": submission.Submission,
         **{name: getattr(contract, name) for name in ("Fitted", "Method", "MethodConfig", "Render", "Run", "Support")},
-        **{one.__name__: one for one in (Camera, Particles, Scene, SignedDistance, TrainingScene)},
+        **{one.__name__: one for one in (Camera, Gaussians, Particles, Scene, SignedDistance, TrainingScene)},
+        **{one.__name__: one for one in (VelocityField, replay.Reconstruction, replay.load)},
     }
     assert sorted(expected) == sorted(set(splashbench.__all__) - {"__version__"})
     for name, value in expected.items():

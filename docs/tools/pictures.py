@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -23,6 +24,7 @@ from scipy import ndimage
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
 from splashbench.errors import SplashbenchError
+from splashbench.replay import load
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.report.results import ResultFile
@@ -35,6 +37,8 @@ from splashbench.study.perturbations.setup import MissingCameras
 from splashbench.study.perturbations.timesteps import FewerTimesteps
 from splashbench.study.scenes import recording_of
 from splashbench.submission import Submission
+from splashbench.video import TRUTH, Comparison, VideoSettings, make_film
+from splashbench.video.layers import LAYERS
 from splashbench_methods.splashsplat.fields.container import known_container
 from splashbench_methods.splashsplat.fields.near_wall import near_wall
 from splashbench_methods.splashsplat.fields.rim import rim_of
@@ -371,6 +375,38 @@ def all_cameras(scene: Scene) -> Path:
     return store(figure, "tutorial_scene.png", 110)
 
 
+def videos() -> list[Path]:
+    """The pictures of docs/videos.md: frames of `splashbench video`."""
+    scene, submissions = fits()
+    ours, other = (load(submissions[name].directory, SCENE) for name in METHODS)
+    time = float(scene.times[FRAME]) + 0.3 * float(scene.times[FRAME + 1] - scene.times[FRAME])
+
+    def frame(compared: Comparison | None = None, place: float = 0, **settings: Any) -> NDArray[np.uint8]:
+        whole = {"start": time, "slow": 8.0} | settings
+        film = make_film(ours, VideoSettings(**whole), compared)
+        return film.frame(int(place * len(film)))
+
+    def stored(name: str, *rows: Sequence[NDArray[np.uint8]]) -> Path:
+        path = IMAGES / name
+        Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(path)
+        # Colours that mean something are chosen with more care than those of photographs.
+        small = Image.open(shrink(path, path, 1080, colours=0))
+        small.quantize(256, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
+        return path
+
+    # Captions of one height, whatever they say.
+    layers = [frame(layer=layer) for layer in LAYERS]
+    tallest = max(len(layer) for layer in layers)
+    layers = [np.pad(layer, ((0, tallest - len(layer)), (0, 0), (0, 0)), constant_values=20) for layer in layers]
+    orbit = {"orbit": True, "end": time, "slow": None, "seconds": 2.0, "resize": 0.75}
+    return [
+        stored("video_layers.png", layers[:3], layers[3:]),
+        stored("video_beside.png", [frame(Comparison([TRUTH, other]))]),
+        stored("video_wipe.png", [frame(Comparison([TRUTH], "wipe", share)) for share in (0.45, 0.55)]),
+        stored("video_orbit.png", [frame(place=place, **orbit) for place in (0, 0.18, 0.32, 0.5)]),
+    ]
+
+
 #: What `main` draws, by name.
 GROUPS: dict[str, Callable[[], list[Path]]] = {
     "chart": chart,
@@ -380,6 +416,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "rims": rims,
     "perturbations": perturbations,
     "tutorial": tutorial,
+    "videos": videos,
 }
 
 if __name__ == "__main__":

@@ -115,6 +115,10 @@ class SpacetimeModel(DynamicModel):
     def splats(self, state: VisibleGaussians, camera: Camera) -> Splats:
         return Splats(state.means, state.factors, state.opacities, state.channels, rows=state.rows)
 
+    def colors(self, splats: Splats) -> Tensor:
+        # Of the full model's channels the features are left out, which only the pixel's ray decodes.
+        return torch.sigmoid(splats.colors[:, :3]) if self.full else splats.colors
+
     def image(self, rendered: Tensor, camera: Camera, time: float) -> Tensor:
         return torch.sigmoid(self.decoded(rendered, camera)) if self.full else rendered
 

@@ -56,14 +56,17 @@ class FittedSplashSplat(Fitted):
 
     def _background(self, camera: Camera) -> np.ndarray:
         # Videos ask for one camera many times in a row, and nothing in the background moves.
-        if self._background_image is None or self._background_image[0] is not camera:
-            self._background_image = camera, np.asarray(self.background.render(camera), dtype=np.float32)
-        return self._background_image[1]
+        # One look at the attribute: another thread may ask for another camera meanwhile.
+        known = self._background_image
+        if known is None or known[0] is not camera:
+            known = self._background_image = camera, np.asarray(self.background.render(camera), dtype=np.float32)
+        return known[1]
 
     def _frozen_background(self, camera: Camera) -> Frozen:
-        if self._frozen is None or self._frozen[0] is not camera:
-            self._frozen = camera, freeze(*self.background.gaussians(camera), camera)
-        return self._frozen[1]
+        known = self._frozen
+        if known is None or known[0] is not camera:
+            known = self._frozen = camera, freeze(*self.background.gaussians(camera), camera)
+        return known[1]
 
     def children(self, camera: Camera, time: float) -> Children | None:
         """The Gaussians of the liquid as `camera` sees them at `time` (seconds); None where there is no liquid.

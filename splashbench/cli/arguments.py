@@ -96,6 +96,32 @@ def add_replace(parser: argparse._ActionsContainer, output: str = "OUT") -> None
     parser.add_argument("--replace", action="store_true", help=f"replace {output} where it exists")
 
 
+def add_dye(parser: argparse._ActionsContainer, required: bool = False) -> None:
+    """Add `--dye`, `--density` and `--light`."""
+    known = "amber, brown, green, blue, clear, or a color as '#rrggbb'"
+    what = known if required else f"dye the liquid anew: {known}"
+    parser.add_argument("--dye", required=required, metavar="DYE", help=what)
+    parser.add_argument(
+        "--density", type=_density, default=1.0, metavar="D", help="times the dye's own, or `opaque` (default: 1)"
+    )
+    parser.add_argument(
+        "--light",
+        type=positive_number("linear light", below=100),
+        default=1.0,
+        metavar="L",
+        help="how bright white would be where the liquid is, in linear light (default: 1)",
+    )
+
+
+def _density(text: str) -> float:
+    if text == "opaque":
+        return math.inf
+    try:
+        return positive_number("times")(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no density; give a number above 0, or `opaque`") from None
+
+
 def add_points(parser: argparse._ActionsContainer) -> None:
     """Add `--points`, the number of initial points of the liquid."""
     parser.add_argument(
@@ -117,7 +143,12 @@ def add_container_masks(parser: argparse._ActionsContainer) -> None:
 
 def add_lpips_weights(parser: argparse._ActionsContainer) -> None:
     """Add `--lpips-weights FILE`."""
-    parser.add_argument("--lpips-weights", type=Path, metavar="FILE", help=".npz of LPIPS weights (AlexNet, v0.1)")
+    parser.add_argument(
+        "--lpips-weights",
+        type=Path,
+        metavar="FILE",
+        help=".npz of LPIPS weights (AlexNet, v0.1; default: those that `splashbench download lpips-weights` fetched)",
+    )
 
 
 def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) -> None:

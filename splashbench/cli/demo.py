@@ -44,8 +44,8 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         subparsers,
         "demo",
         run,
-        summary="every step once on a synthetic pour: film, prepare, reconstruct, score, chart",
-        description="Film a synthetic pour, prepare it, reconstruct it, score it and draw the leaderboard.",
+        summary="every step once on a synthetic pour: film, prepare, reconstruct, score, chart, video",
+        description="Film a synthetic pour, prepare it, reconstruct it, score it, draw the leaderboard and a video.",
         epilog=_EPILOG,
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder for everything the demo makes")
@@ -84,6 +84,12 @@ def run(arguments: argparse.Namespace) -> int:
         stale=(results,),
     )
     steps.always("draw the leaderboard", ["leaderboard", str(results), str(out / "leaderboard")])
+    video, shown = out / "splashsplat.mp4", str(runs["splashsplat"])
+    steps.run(
+        "show splashsplat beside the truth at half speed",
+        video,
+        ["video", shown, str(video), "--scene", str(scene), "--beside", "truth", "--slow", "2"],
+    )
 
     gates = _gates(truth, results)
     text = _summary(out, gates, time.monotonic() - start)
@@ -193,6 +199,7 @@ def _summary(out: Path, gates: list[_Gate], seconds: float) -> str:
             table(["check", "value", "limit", ""], [gate.row() for gate in gates]),
             "",
             "look at",
+            f"  {out / 'splashsplat.mp4'}    the reconstruction beside the truth at half speed",
             f"  {out / 'contact_sheet.png'}    truth, renders and foreground opacity at the test views",
             f"  {out / 'leaderboard' / 'index.html'}    the figures as a page, with charts; tables lie beside it",
             f"  {out / 'scene' / 'prepare_report.html'}    how the recording became a scene, with every check",

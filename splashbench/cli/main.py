@@ -28,7 +28,7 @@ from splashbench.version import __version__
 #: In the order of the work: session, scene, method, submission, result.
 COMMANDS = (
     *("demo", "synth", "prepare", "masks", "scene", "methods", "run", "run-external", "check", "explain"),
-    *("score", "leaderboard", "study"),
+    *("view", "video", "restyle", "export", "download", "score", "leaderboard", "study"),
 )
 
 _EPILOG = """\
@@ -38,6 +38,9 @@ the usual order:
   splashbench prepare SESSION SCENE                 calibrate, synchronise, mask, crop
   splashbench run splashsplat SCENE SUBMISSION      reconstruct
   splashbench explain SUBMISSION                    why the fit is as large and as slow as it is
+  splashbench download lpips-weights                once: the network weights of the metric LPIPS
+  splashbench video SUBMISSION OUT.mp4              look at it, from anywhere and at any speed
+  splashbench export SUBMISSION OUT --format mesh   for Blender, SuperSplat, numpy
   splashbench score SUBMISSION --scene SCENE --out RESULTS
   splashbench leaderboard RESULTS OUT               CSV, table and charts
   splashbench study run ablation OUT --scenes SCENE     many runs in one table

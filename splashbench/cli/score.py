@@ -23,8 +23,9 @@ examples:
 Beside each result lie its pictures (.jpg), which the leaderboard's page shows. A run with checkpoints has them scored.
 Ground truth comes from SCENE alone. A failed run becomes a result with its status and without scores. --reference
 takes the submission of the control `nothing` on the same scene and gives dpsnr_bg and spill_rgb. LPIPS needs weights,
-else it is null: --lpips-weights, the environment variable SPLASHBENCH_LPIPS_WEIGHTS, or an installed lpips package with
-torchvision's AlexNet cached. Where a synthetic SCENE has true particles, geometry and motion are compared with them.
+else it is null: `splashbench download lpips-weights` fetches them once. Before those come --lpips-weights and the
+environment variable SPLASHBENCH_LPIPS_WEIGHTS, after them an installed lpips package with torchvision's AlexNet cached.
+Where a synthetic SCENE has true particles, geometry and motion are compared with them.
 """
 
 # Columns of the printed table; a result has every metric. Those against true particles have a table of their own.
@@ -56,12 +57,15 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.report.result_sheet import write_result_sheet
     from splashbench.scene import Scene
     from splashbench.score import score_submission, shared_fields
-    from splashbench.submission import Submission
+    from splashbench.submission import Submission, require_outside
 
     protocol = _protocol(arguments.changes)
+    sealed = [*arguments.submissions, *([arguments.reference] if arguments.reference else [])]
     require_folder_place(arguments.out)
+    require_outside(arguments.out, *sealed)
     if arguments.sheet:
         require_file_place(arguments.sheet)
+        require_outside(arguments.sheet, *sealed)
     scene = Scene.open(arguments.scene)
     # All are opened, hence verified, first: scoring may take hours.
     submissions = [Submission.open(path) for path in arguments.submissions]

@@ -1,13 +1,15 @@
 """Point clouds and meshes as .ply (Turk, The PLY Polygon File Format, 1994).
 
 A point cloud is binary: a row per point and a number per property. Published codes write Gaussians and anchors so, and
-ask for their first points so. A file that is read comes from a stranger: its header is held against the file's size
-before anything else is read. The usual library, plyfile, has a licence (GPL) that does not go with this project's.
+ask for their first points so; other programs take meshes so. A file that is read comes from a stranger: its header is
+held against the file's size before anything else is read. The usual library, plyfile, has a licence (GPL) that does not
+go with this project's.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,10 +29,8 @@ _TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_COLORED_POINT = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
-)
-_WRITTEN_TYPES = {"<f4": "float", "|u1": "uchar"}
+_WRITTEN_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<i4": "int"}
+_TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _NAME = re.compile(r"\w{1,64}", re.ASCII)
 _END = re.compile(rb"^end_header\r?\n", re.MULTILINE)
 
@@ -134,15 +134,37 @@ def write_colored_points(path: Path, points: NDArray[np.float64]) -> None:
 
     Codes built on 3D Gaussian Splatting ask for normals, too; they are zero.
     """
-    vertices = np.zeros(len(points), _COLORED_POINT)
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = points[:, column]
-    for column, name in enumerate(("red", "green", "blue"), 3):
-        vertices[name] = np.rint(np.clip(points[:, column], 0, 1) * 255)
-    properties = [f"property {_WRITTEN_TYPES[vertices.dtype[name].str]} {name}" for name in _COLORED_POINT.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    tables: dict[tuple[str, ...], NDArray] = {
+        ("x", "y", "z"): points[:, :3].astype(np.float32),
+        ("nx", "ny", "nz"): np.zeros((len(points), 3), np.float32),
+        ("red", "green", "blue"): np.rint(np.clip(points[:, 3:], 0, 1) * 255).astype(np.uint8),
+    }
+    write_vertices(path, tables)
+
+
+def write_vertices(
+    path: Path, tables: Mapping[tuple[str, ...], NDArray], faces: NDArray[np.integer] | None = None
+) -> None:
+    """Write points with properties, or the triangles between them, as binary, atomically.
+
+    Args:
+        tables: names of properties -> [V, number of names], of float32, float64, uint8 or int32.
+        faces: [F, 3] of row numbers; None for points alone. A file of nothing is a valid one, too.
+    """
+    kinds = [(name, table.dtype.newbyteorder("<")) for names, table in tables.items() for name in names]
+    rows = np.empty(len(next(iter(tables.values()))), np.dtype(kinds))
+    for names, table in tables.items():
+        for column, name in enumerate(names):
+            rows[name] = table[:, column]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {_WRITTEN_TYPES[kind.str]} {name}" for name, kind in kinds]
+    triangles = np.zeros(0 if faces is None else len(faces), _TRIANGLE)
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        triangles["count"], triangles["corners"] = 3, faces
+    head = "\n".join([*header, "end_header", ""]).encode("ascii")
     with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + vertices.tobytes())
+        temporary.write_bytes(head + rows.tobytes() + triangles.tobytes())
 
 
 def write_mesh(path: Path, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:

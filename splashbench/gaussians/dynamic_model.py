@@ -58,6 +58,10 @@ class DynamicModel(nn.Module, ABC):
         """What is to be rasterized behind all Gaussians, [C], so that `image` makes the colour `backdrop` [3] of it."""
         return backdrop
 
+    def colors(self, splats: Splats) -> Tensor:
+        """sRGB [N, 3] of single Gaussians, for viewers; where pixels are decoded together, nearly theirs."""
+        return splats.colors
+
     def view(self, splats: Splats, camera: Camera, time: float) -> Tensor:
         """The image [H, W, 3] of `splats` over the backdrop; not clipped."""
         behind = None if self.backdrop is None else self.channels_behind(self.backdrop)

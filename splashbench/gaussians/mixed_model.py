@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splashbench.background.depth import common_target
 from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import atomic_path, read_npz
 from splashbench.gaussians.dynamic_model import DynamicModel
@@ -23,7 +24,7 @@ from splashbench.harness.contract import Fitted, Render
 from splashbench.observe.consistency import silhouette_consistent
 from splashbench.render import counters, rasterize_arrays
 from splashbench.render.constants import MIN_ALPHA
-from splashbench.scene import Camera, Particles, TrainingScene
+from splashbench.scene import Camera, Gaussians, Particles, TrainingScene, look_at
 
 MODEL_FILE = "model.npz"
 _HISTORY_FILE = "history.json"
@@ -105,6 +106,38 @@ class MixedFitted(Fitted):
         ever = active.any(axis=0)
         times = [self.model_time(float(seconds)) for seconds in self.scene.times]
         return Particles(np.stack([self._means(time)[ever] for time in times]), active[:, ever])
+
+    def gaussians(self, time: float, eye: NDArray) -> Gaussians:
+        """Those of the liquid, as the silhouettes of the nearest timestep say."""
+        return self._apart(time, eye, liquid=True)
+
+    def static_gaussians(self, eye: NDArray) -> Gaussians:
+        """Those that are not the liquid's, as they are at the first timestep: nothing is apart in such a model."""
+        return self._apart(float(self.scene.times[0]), eye, liquid=False)
+
+    @torch.no_grad()
+    def _apart(self, time: float, eye: NDArray, liquid: bool) -> Gaussians:
+        camera = self.lens(self._wide_camera(eye))
+        with one_torch_thread():
+            splats = self.model.splats(self.model.at(self.model_time(time)), camera)
+            colors = self.model.colors(splats).clamp(0, 1)
+        chosen = self.liquid(int(np.abs(self.scene.times - time).argmin()))
+        if splats.rows is not None:
+            chosen = chosen[splats.rows.numpy()]
+        parts = (splats.means, splats.factors, splats.opacities, colors)
+        return Gaussians(*(part.numpy()[chosen == liquid] for part in parts))
+
+    def _wide_camera(self, eye: NDArray) -> Camera:
+        """A camera at `eye` that nearly everything before it is seen by: models leave out what none could see."""
+        cameras = list(self.scene.cameras.values())
+        up = -np.mean([camera.w2c[1, :3] for camera in cameras], axis=0)
+        return Camera(
+            "eye",
+            512,
+            512,
+            np.array([[40.0, 0, 256], [0, 40, 256], [0, 0, 1]]),
+            look_at(eye, common_target(cameras), up),
+        )
 
     def save(self, directory: Path) -> None:
         arrays = {name: tensor.detach().numpy() for name, tensor in self.model.state_dict().items()}

@@ -7,6 +7,7 @@ recorded status. CONTRIBUTING.md shows a complete method in one file.
 
 from __future__ import annotations
 
+import difflib
 import textwrap
 import time
 from abc import ABC, abstractmethod
@@ -256,7 +257,10 @@ class MethodConfig(BaseModel):
                 raise SplashbenchError(str(first["ctx"]["error"])) from None
             key = ".".join(str(part) for part in first["loc"])
             fields = ", ".join(sorted(cls.model_fields)) or "none"
-            raise SplashbenchError(f"setting {key}: {first['msg']}; this method's settings: {fields}") from None
+            unknown = first["type"] == "extra_forbidden"
+            near = difflib.get_close_matches(key, [*cls.model_fields], n=1) if unknown else []
+            remedy = f"did you mean {near[0]}?" if near else f"this method's settings: {fields}"
+            raise SplashbenchError(f"setting {key}: {first['msg']}; {remedy}") from None
 
 
 class Fitted(ABC):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
+import weakref
 from functools import cached_property
 from pathlib import Path
 
@@ -29,21 +31,20 @@ class Reconstruction:
         submission: what it was read from. name: of the method, as in charts.
         scene: the Scene where it was given, else None: then there are no photographs to compare with.
         cameras: name -> Camera, training cameras first. train, test: their names.
-        times: [T] seconds, the timesteps that the method saw.
+        times: [T] seconds, the timesteps that the method saw. times_source: as of a Scene; "nominal" is an order alone.
         fitted: the method's model, or the stored views where no model is kept.
     """
 
-    def __init__(
-        self, submission: Submission, fitted: Fitted, known: TrainingScene, scene: Scene | None, scratch: object = None
-    ) -> None:
+    def __init__(self, submission: Submission, fitted: Fitted, known: TrainingScene, scene: Scene | None) -> None:
         self.submission, self.fitted, self.scene = submission, fitted, scene
         self.name = submission.identity.method
         self.train, self.test = tuple(known.train), tuple(known.test)
         self.cameras: dict[str, Camera] = {**known.cameras, **known.test_cameras}
         self.times: NDArray[np.float64] = known.times
+        self.times_source = known.times_source
         self.camera_times = known.camera_times
         self.gravity, self.metres_per_unit = known.gravity, known.metres_per_unit
-        self._known, self._scratch = known, scratch
+        self._known = known
 
     def __repr__(self) -> str:
         identity = self.submission.identity
@@ -55,6 +56,10 @@ class Reconstruction:
     def has_model(self) -> bool:
         """Whether it can be rendered from anywhere; else there are the submission's own views alone."""
         return not isinstance(self.fitted, StoredViews)
+
+    def shown_by(self, fitted: Fitted) -> Reconstruction:
+        """The same liquid, rendered by another model, such as one of another dye."""
+        return Reconstruction(self.submission, fitted, self._known, self.scene)
 
     def camera(self, name: str) -> Camera:
         """The scene's camera `name`. Raises SplashbenchError where there is none."""
@@ -157,7 +162,7 @@ def load(
             f"{submission} was made for another version of scene {identity.scene} than {scene}; give the scene it was "
             "run on"
         )
-    known, scratch = _known_scene(opened, whole)
+    known = _known_scene(opened, whole)
     model = opened.directory / "model"
     if not model.is_dir():
         return Reconstruction(opened, StoredViews(opened, known, _NO_MODEL), known, whole)
@@ -176,22 +181,24 @@ def load(
     except Exception as error:
         said = f"{type(error).__name__}: {error}"
         raise SplashbenchError(f"{model} cannot be loaded by {loader.id} {loader.version} ({said})") from error
-    return Reconstruction(opened, fitted, known, whole, scratch)
+    return Reconstruction(opened, fitted, known, whole)
 
 
-def _known_scene(submission: Submission, scene: Scene | None) -> tuple[TrainingScene, object]:
-    """What the method is told when its model is loaded, and what has to live as long as it."""
+def _known_scene(submission: Submission, scene: Scene | None) -> TrainingScene:
+    """What the method is told when its model is loaded."""
     identity = submission.identity
     if scene is not None and identity.withheld is None:
-        return scene.training(), None
+        return scene.training()
     if scene is not None:
-        scratch = tempfile.TemporaryDirectory(prefix="splashbench-")
+        scratch = Path(tempfile.mkdtemp(prefix="splashbench-"))
         kept = kept_timesteps(scene.n_frames, identity.withheld)
-        return Scene.open(make_training_copy(scene, Path(scratch.name, "scene"), kept)).training(), scratch
+        known = Scene.open(make_training_copy(scene, scratch / "scene", kept)).training()
+        weakref.finalize(known, shutil.rmtree, scratch, ignore_errors=True)  # links and small files
+        return known
     absent = read_cameras(submission.directory)
     if absent is None:
         raise SplashbenchError(
             f"{submission.directory} has no {CAMERAS}, as it was written by an earlier version; give its scene "
             "(--scene, or scene=...)"
         )
-    return absent, None
+    return absent

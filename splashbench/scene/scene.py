@@ -75,6 +75,12 @@ class Scene:
             raise SplashbenchError(f"{directory} is not a folder; give the folder of a scene")
         return cls(NeuroFluidSource(directory) if is_neurofluid(directory) else ReleasedSource(directory))
 
+    def __repr__(self) -> str:
+        first = self.cameras[self.train[0]]
+        seconds = f"{self.times[-1] - self.times[0]:.3g} s ({self.times_source})"
+        cameras = f"{len(self.train)} training and {len(self.test)} test cameras of {first.width}x{first.height}"
+        return f"<Scene {self.name}: {self.n_frames} timesteps in {seconds}, {cameras}>"
+
     def _size(self, camera: str) -> tuple[int, int]:
         if self.meta and self.meta.sizes and camera in self.meta.sizes:
             return self.meta.sizes[camera]
@@ -250,6 +256,9 @@ class TrainingScene:
         self.container_transparent = scene.container_transparent
         #: how it differs from the scene in its folder; empty where it does not
         self.variation = ""
+
+    def __repr__(self) -> str:
+        return f"<TrainingScene {self.name}: {self.n_frames} timesteps, training cameras {', '.join(self.train)}>"
 
     def _training_only(self, camera: str) -> None:
         if camera not in self.cameras:

@@ -241,7 +241,7 @@ def _conditions(capacity: CapacityPlan, store: Store, frame: pd.DataFrame) -> st
         ),
     ]
     if frame["psnr"].notna().any() and frame["lpips"].isna().all():
-        lines.append("No LPIPS, since there are no weights: give --lpips-weights")
+        lines.append("No LPIPS, since there are no weights: `splashbench download lpips-weights` fetches them")
     at_once = max((entry.at_once for entry in entries), default=1)
     lines += [f"{at_once} runs at once: fit times compare poorly"] if at_once > 1 else []
     return bullets(map(one_line, lines)) + "\n" + scenes_and_machines(plan.scenes, results)

@@ -11,19 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.files import atomic_path
-
-
-def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Undo the sRGB transfer curve (IEC 61966-2-1) on values in [0, 1]."""
-    values = np.clip(np.asarray(values, dtype=np.float32), 0.0, 1.0)
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+from splashbench.srgb import to_linear
 
 
 def write_exr(path: Path, rgb: NDArray[np.floating], alpha: NDArray[np.floating]) -> None:
     """Write one frame: rgb [H, W, 3] sRGB in [0, 1], alpha [H, W]. RGB is the whole picture, not premultiplied."""
     import OpenEXR
 
-    pixels = np.concatenate([srgb_to_linear(rgb), np.asarray(alpha, dtype=np.float32)[..., None]], axis=-1)
+    pixels = np.concatenate([to_linear(rgb), np.asarray(alpha, dtype=np.float32)[..., None]], axis=-1)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary, OpenEXR.File(header, {"RGBA": pixels.astype(np.float16)}) as file:
         file.write(str(temporary))

@@ -106,6 +106,13 @@ class Submission(Views):
         self.record = record
         self.status, self.reason = record.status, record.reason
 
+    def __repr__(self) -> str:
+        identity, record = self.identity, self.record
+        costs = [] if record.fit_seconds is None else [f"fit {record.fit_seconds:.0f} s"]
+        costs += [] if record.storage_bytes is None else [f"{record.storage_bytes / 1e6:.1f} MB"]
+        run = f"{identity.method} ({identity.preset}, seed {identity.seed}) of {identity.scene}"
+        return f"<Submission {run}: {', '.join([self.status.value, *costs])}>"
+
     @classmethod
     def open(cls, directory: Path, verify: bool = True) -> Submission:
         """Read the submission in `directory`; with `verify`, refuse it when a file was changed, added or removed."""
@@ -143,6 +150,13 @@ class Submission(Views):
         """The liquid's signed distance, or None."""
         path = self.directory / "geometry.npz"
         return SignedDistance.load(path) if path.is_file() else None
+
+
+def require_outside(out: Path, *submissions: Path) -> None:
+    """Raise SplashbenchError where `out` lies in one of `submissions`: a file that is added there breaks its seal."""
+    for submission in submissions:
+        if Path(out).resolve().is_relative_to(Path(submission).resolve()):
+            raise SplashbenchError(f"{out} lies in {submission}, whose files are sealed; give a place outside it")
 
 
 def integrity_faults(directory: Path) -> list[str]:

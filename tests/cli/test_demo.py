@@ -81,3 +81,26 @@ def test_a_folder_becomes_the_demos_only_where_it_is_empty(tmp_path: Path) -> No
     (tmp_path / "photos" / "holiday.jpg").write_bytes(b"dear")
     with pytest.raises(SplashbenchError, match="holds files that are not the demo's"):
         demo._claim(tmp_path / "photos")
+
+
+def test_the_demo_ends_with_a_video_and_all_its_commands_exist(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from splashbench.cli.main import build_parser
+
+    commands: list[argparse.Namespace] = []
+    parser = build_parser()
+
+    class Noting:
+        def parse_args(self, words: list[str]) -> argparse.Namespace:
+            commands.append(parser.parse_args(words))
+            return argparse.Namespace(handler=lambda _: 0)
+
+    monkeypatch.setattr("splashbench.cli.main.build_parser", Noting)
+    monkeypatch.setattr(demo, "_gates", lambda *_: [demo._Gate("error", 0.5, 1.0, True)])
+    out = tmp_path / "out"
+    assert demo.run(parser.parse_args(["demo", str(out)])) == 0
+    last = commands[-1]
+    assert (last.command, last.beside, last.slow) == ("video", ["truth"], 2)
+    assert (last.submission, last.out) == (out / "submissions" / "splashsplat", out / "splashsplat.mp4")
+    assert f"{out / 'splashsplat.mp4'}    the reconstruction beside the truth" in (out / "README.txt").read_text()

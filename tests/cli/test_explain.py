@@ -212,7 +212,7 @@ def test_what_cannot_be_drawn_is_one_line(place: Path, tmp_path: Path, fails: Fa
     assert "chart.pdf is neither .png nor .svg" in fails("explain", place, "--out", tmp_path / "chart.pdf")
     assert "there is no decision to draw" in fails("explain", place, "--out", tmp_path / "chart.png")
     # It would be a file that SHA256SUMS does not list.
-    assert "lies in the submission" in fails("explain", place, "--out", place / "chart.png")
+    assert "whose files are sealed" in fails("explain", place, "--out", place / "chart.png")
     assert "chart.png is a folder" in fails("explain", place, "--out", _folder(tmp_path / "chart.png"))
     assert _names(place) == ["SHA256SUMS", "record.json", "submission.toml"]
 

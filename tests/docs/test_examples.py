@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import runpy
 from pathlib import Path
 from typing import Any
@@ -62,3 +63,30 @@ def test_two_methods_compared(tmp_path: Path) -> None:
     board = next(path for path in files if path.suffix == ".csv").read_text(encoding="utf-8")
     assert "nearest_camera" in board
     assert "nothing" in board
+
+
+def test_the_notebook_runs_and_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+
+    notebook = json.loads((EXAMPLES / "look_at_a_splash.ipynb").read_text(encoding="utf-8"))
+    assert notebook["nbformat"] == 4
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells)  # none is committed
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for cell in cells:
+        exec(compile("".join(cell["source"]), "look_at_a_splash.ipynb", "exec"), names)
+    assert "splashsplat (quick)" in repr(names["splash"])
+    assert names["volume"] > 0
+    assert names["interface"].seen.any()
+    figures = [plt.figure(number) for number in plt.get_fignums()]
+    assert len(figures) == 3
+    for figure in figures:
+        figure.canvas.draw()
+        assert np.asarray(figure.canvas.buffer_rgba()).std() > 10
+    plt.close("all")

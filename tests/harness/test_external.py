@@ -132,6 +132,7 @@ def test_a_failing_code_gets_a_status_and_a_reason(
     assert str(tmp_path) not in submission.reason
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "SHA256SUMS",
+        "cameras.json",
         "record.json",
         "submission.toml",
     ]

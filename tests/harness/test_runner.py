@@ -161,3 +161,8 @@ def test_overrides_are_parsed_into_nested_settings() -> None:
 def test_the_log_of_a_crash_is_kept(balls_directory: Path, tmp_path: Path) -> None:
     _run("Crash", balls_directory, tmp_path / "out")
     assert any("singular" in line for line in read_json(tmp_path / "out" / "record.json")["log_tail"])
+
+
+def test_a_mistyped_setting_names_the_near_one(balls_directory: Path, tmp_path: Path) -> None:
+    with pytest.raises(SplashbenchError, match=r"setting iteratons: .*; did you mean iterations\?"):
+        run_method("splashsplat", balls_directory, tmp_path / "out", overrides={"iteratons": 3})

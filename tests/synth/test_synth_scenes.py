@@ -164,3 +164,24 @@ def test_an_unknown_scene_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SplashbenchError, match="opaque_bowl"):
         make_scene("volcano", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_dye_changes_the_liquids_color_and_nothing_else(tank: Scene, tmp_path: Path) -> None:
+    green = make_scene("glass_tank", tmp_path / "g", size=(96, 64), timesteps=4, particle_radius=0.006, dye="green")
+    assert green.name == "synthetic_glass_tank_green"
+    assert green.meta is not None
+    assert green.meta.provenance["dye"] == "green"
+    np.testing.assert_array_equal(green.truth_particles().positions, tank.truth_particles().positions)
+    mask = tank.mask("1", 3)
+    np.testing.assert_array_equal(green.mask("1", 3), mask)
+    assert green.image("1", 3)[mask].mean(axis=0).argmax() == 1
+    assert tank.image("1", 3)[mask].mean(axis=0).argmax() == 2
+    # Far from the liquid and its shadow not a bit differs.
+    np.testing.assert_array_equal(green.image("1", 3)[:8, :20], tank.image("1", 3)[:8, :20])
+
+
+def test_a_dye_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["synth", "scene", "glass_tank", str(tmp_path / "x"), "--dye", "purple"]) == 1
+    assert "there is no dye 'purple'" in capsys.readouterr().err
+    assert main(["synth", "scene", "balls", str(tmp_path / "x"), "--dye", "green"]) == 1
+    assert "--dye is for simulated scenes" in capsys.readouterr().err

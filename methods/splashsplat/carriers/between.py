@@ -1,7 +1,8 @@
 """The liquid between two frames, shown by the carriers of both. The paper shows those of the one before, see "forward".
 
 Each frame's carriers are moved to the time, forwards or backwards, and count by the nearness of their frame: at a
-frame's own time the other's are gone, so that nothing jumps. Three rules say which are moved and how opaque they are.
+frame's own time the other's are gone, and they come and go without a kink there: slow motion does not pulse with the
+frames. Three rules say which are moved and how opaque they are.
 
 - Where the liquid keeps its place, as a pool or a steady jet does, carriers stay. What they show keeps its place too:
   a jet flows on, and the light on it does not.
@@ -82,25 +83,31 @@ def _of_frame(track: Track, t: int, fraction: float, overlap: np.ndarray) -> lis
     arrival = (sample(track.phi[other], there) / STEPS_PER_VOXEL).astype(np.float32)
     along = (1 - far) * still.phi + far * torch.from_numpy(arrival)
     phi = torch.where(along.abs() < moved.phi.abs(), along, moved.phi)
-    astray = np.clip((arrival - _ASTRAY) / (_LOST - _ASTRAY), 0, 1)
-    fade = 1 - far * torch.from_numpy(astray * astray * (3 - 2 * astray))
+    nearness = 1 - float(_eased(np.array(far)))
+    fade = 1 - (1 - nearness) * torch.from_numpy(_eased((arrival - _ASTRAY) / (_LOST - _ASTRAY)))
     keep = torch.from_numpy(stays)
     state = CarrierState(
         torch.where(keep[:, None], still.positions, moved.positions),
         torch.where(keep[:, None, None], still.deformation, moved.deformation),
         torch.where(keep, still.phi, phi),
-        (1 - far) * torch.where(keep, torch.ones_like(fade), fade),
+        nearness * torch.where(keep, torch.ones_like(fade), fade),
     )
     now = track.grid.to_voxels(state.positions.numpy())
     gaps = torch.from_numpy(_has_left(here, now, track.grid) & ~stays & (sample(track.phi[other], here) <= 0))
-    distance = torch.from_numpy(np.linalg.norm(now - here, axis=1).astype(np.float32))
+    left = torch.from_numpy(_eased(np.linalg.norm(now - here, axis=1) / _GAP))
     filling = CarrierState(
         still.positions[gaps],
         still.deformation[gaps],
         still.phi[gaps],
-        (1 - far) * (distance[gaps] / _GAP).clamp(max=1),
+        nearness * left[gaps],
     )
     return [(ids, state), (ids[gaps], filling)]
+
+
+def _eased(share: np.ndarray) -> np.ndarray:
+    """From 0 to 1 as `share` does, float32, level at both ends."""
+    share = np.clip(share, 0, 1).astype(np.float32)
+    return np.asarray(share * share * (3 - 2 * share))
 
 
 def _has_left(before: np.ndarray, now: np.ndarray, grid: Grid) -> np.ndarray:

@@ -63,8 +63,8 @@ def export_scene(
     with atomic_directory(out, replace=replace, holds=FACTS, inputs=[scene.directory]) as staging:
         export = Export(scene, staging, points, Clock.of(scene), test_images, masks)
         FORMATS[format_name](export)
-        write_model(staging / TEST_VIEWS, WantedViews.of(export))
-        written = export_facts(export, format_name)
+        write_model(staging / TEST_VIEWS, WantedViews.of(export, scene.name))
+        written = export_facts(export, scene, format_name)
         write_model(staging / FACTS, written)
     return written
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
 from splashbench.progress import track
 from splashbench.scene.camera import Camera
-from splashbench.scene.scene import Scene
 
 #: Of test views: no images; black ones, for codes that open them while loading; the ground truth.
 TestImages = Literal["none", "blank", "true"]
@@ -37,6 +36,22 @@ def max_static(format_name: str) -> int:
 _NO_SKEW = 1e-9
 
 
+class Recording(Protocol):
+    """What an export needs of a scene; attributes and methods as `Scene` has them."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    cameras: dict[str, Camera]
+    camera_times: dict[str, NDArray[np.float64]]
+    n_frames: int
+
+    def image(self, camera: str, t: int) -> NDArray[np.uint8]:
+        """sRGB uint8 [H, W, 3] of `camera` at timestep `t`."""
+
+    def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
+        """Liquid mask [H, W] of `camera` at timestep `t`."""
+
+
 @dataclass(frozen=True)
 class Clock:
     """Seconds to a time in [0, 1]: 0 is the first exposure of any camera, 1 the last one, `span` seconds later."""
@@ -45,7 +60,7 @@ class Clock:
     span: float
 
     @classmethod
-    def of(cls, scene: Scene) -> Clock:
+    def of(cls, scene: Recording) -> Clock:
         """The clock of `scene`."""
         times = np.stack([scene.camera_times[name] for name in scene.cameras])
         return cls(float(times.min()), float(times.max() - times.min()))
@@ -99,14 +114,18 @@ class ExportView(NamedTuple):
 
 @dataclass(frozen=True)
 class Export:
-    """One export under way: what is written, where to, and how much of the test views."""
+    """One export under way: what is written, where to, and how much of the test views.
 
-    scene: Scene
+    photographs: whether there are images at all; without them an export has cameras and points.
+    """
+
+    scene: Recording
     directory: Path
     points: InitialPoints
     clock: Clock
     test_images: TestImages = "none"
     masks: bool = False
+    photographs: bool = True
 
     def views(self, names: Sequence[str]) -> list[ExportView]:
         """The views of the cameras `names`, all of a camera's after one another."""
@@ -129,7 +148,7 @@ class Export:
 
     def has_image(self, view: ExportView) -> bool:
         """Whether `view` has an image file in this export."""
-        return self.test_images != "none" or view.camera.name in self.scene.train
+        return self.photographs and (self.test_images != "none" or view.camera.name in self.scene.train)
 
     def has_mask(self, view: ExportView) -> bool:
         """Whether `view` has a mask file in this export. A test mask is ground truth, as a test image is."""

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from splashbench.scene.camera import Camera
 from splashbench.scene.export.content import Export, TestImages, max_static
+from splashbench.scene.scene import Scene
 
 #: The file by which an export is recognised.
 FACTS = "splashbench.json"
@@ -71,13 +72,13 @@ class WantedViews(_Strict):
     views: list[WantedView]
 
     @classmethod
-    def of(cls, export: Export) -> WantedViews:
-        """The test views of `export`."""
+    def of(cls, export: Export, name: str) -> WantedViews:
+        """The test views of `export`, which is of the scene `name`."""
         return cls(
-            scene=export.scene.name,
+            scene=name,
             time_origin_seconds=export.clock.origin,
             time_span_seconds=export.clock.span,
-            cameras={name: _wanted_camera(export.scene.cameras[name]) for name in export.scene.test},
+            cameras={camera: _wanted_camera(export.scene.cameras[camera]) for camera in export.scene.test},
             views=[
                 WantedView(
                     camera=view.camera.name,
@@ -96,9 +97,8 @@ def _wanted_camera(camera: Camera) -> WantedCamera:
     return WantedCamera(width=camera.width, height=camera.height, K=camera.K.tolist(), w2c=camera.w2c.tolist())
 
 
-def export_facts(export: Export, format_name: str) -> ExportFacts:
-    """splashbench.json of `export`."""
-    scene = export.scene
+def export_facts(export: Export, scene: Scene, format_name: str) -> ExportFacts:
+    """splashbench.json of `export`, which is of `scene`."""
     return ExportFacts(
         format=format_name,
         scene=scene.name,

@@ -1,45 +1,45 @@
 """LPIPS v0.1 with AlexNet (Zhang et al. 2018) in plain torch: five convolutions and five 1x1 linear heads.
 
 No torchvision is needed. Weights come from an .npz (`--lpips-weights`, or the environment variable
-SPLASHBENCH_LPIPS_WEIGHTS), else from an installed `lpips` package's own file together with torchvision's AlexNet in the
-torch.hub cache. Where neither can be had LPIPS is null with a reason; other weights than v0.1's are refused.
+SPLASHBENCH_LPIPS_WEIGHTS), else from the cache folder, where `splashbench download lpips-weights` puts them, else from
+an installed `lpips` package's own file together with torchvision's AlexNet in the torch.hub cache. Where none can be
+had LPIPS is null with a reason; other weights than v0.1's are refused.
 """
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
 from splashbench.score.image.fidelity import Image
+from splashbench.score.image.weights import (
+    ALEXNET_FILE,
+    HEADS_FILE,
+    RANKS,
+    WEIGHTS_SHA256,
+    Weights,
+    checkpoint_weights,
+    verified_weights,
+    weights_digest,
+    weights_path,
+)
 
 if TYPE_CHECKING:
     import torch
 
 WEIGHTS_VARIABLE = "SPLASHBENCH_LPIPS_WEIGHTS"
-# `weights_digest` of torchvision's IMAGENET1K_V1 AlexNet and LPIPS v0.1's linear weights.
-WEIGHTS_SHA256 = "3a6b685efb624231c58b6d5e9951d6ed4f9e15f02b6c67a6b75cdbfc13541748"
 
-_ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
-# Index of each convolution in torchvision's `features`.
-_TORCHVISION_LAYERS = (0, 3, 6, 8, 10)
+_REMEDY = "run `splashbench download lpips-weights` once, or give --lpips-weights"
 # (stride, padding) of each convolution, and whether a 3x3 max pooling of stride 2 comes before it.
 _CONVOLUTIONS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
-_RANKS = {
-    **{f"conv{i}.{part}": rank for i in range(1, 6) for part, rank in (("weight", 4), ("bias", 1))},
-    **{f"lin{i}": 1 for i in range(5)},
-}
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-
-Weights = dict[str, NDArray[np.float32]]
 
 
 class Lpips:
@@ -88,69 +88,49 @@ class Lpips:
         return features
 
 
-def weights_digest(weights: Weights) -> str:
-    """SHA-256 of the arrays' shapes and values, whatever file they came from."""
-    digest = hashlib.sha256()
-    for name in _RANKS:
-        array = np.ascontiguousarray(weights[name], dtype="<f4")
-        digest.update(f"{name} {array.shape}".encode() + array.tobytes())
-    return digest.hexdigest()
-
-
 def load_lpips(path: Path | None = None) -> tuple[Lpips | None, str]:
-    """(metric, "") where weights can be had, else (None, reason). A file that was named must be good.
+    """(metric, "") where weights can be had, else (None, reason). A file that was named or fetched must be good.
 
     Args:
-        path: an .npz with conv1..5.weight/.bias and lin0..4; None looks at the environment, then at installed packages.
+        path: an .npz with conv1..5.weight/.bias and lin0..4; None looks at the environment, then into the cache
+            folder, then at installed packages.
     """
     weights_file = path or os.environ.get(WEIGHTS_VARIABLE)
     if weights_file:
-        return Lpips(read_npz(Path(weights_file), _RANKS)), ""
+        return Lpips(read_npz(Path(weights_file), RANKS)), ""
+    cached = _cached_file()
+    if cached is not None:
+        weights = verified_weights(cached)
+        if weights is None:
+            raise SplashbenchError(
+                f"{cached} is damaged or no file of LPIPS weights; `splashbench download lpips-weights` replaces it"
+            )
+        return Lpips(weights), ""
     heads = _lpips_package_file()
     if heads is None:
-        return (
-            None,
-            f"no LPIPS weights: give --lpips-weights or set {WEIGHTS_VARIABLE}, or install lpips and torchvision",
-        )
+        return None, f"no LPIPS weights: {_REMEDY}"
     import torch
 
-    alexnet = Path(torch.hub.get_dir(), "checkpoints", _ALEXNET_FILE)
+    alexnet = Path(torch.hub.get_dir(), "checkpoints", ALEXNET_FILE)
     if not alexnet.is_file():
-        return None, f"no LPIPS weights: {_ALEXNET_FILE} is not in the torch.hub cache; give --lpips-weights"
-    return Lpips(_package_weights(alexnet, heads)), ""
+        return None, f"no LPIPS weights: {ALEXNET_FILE} is not in the torch.hub cache; {_REMEDY}"
+    return Lpips(checkpoint_weights(alexnet, heads)), ""
+
+
+def _cached_file() -> Path | None:
+    """What `splashbench download lpips-weights` left, if anything."""
+    try:
+        path = weights_path()
+    except SplashbenchError:  # no home folder: nothing was left
+        return None
+    return path if path.exists() else None
 
 
 def _lpips_package_file() -> Path | None:
     """The linear weights inside an installed `lpips` package, found without importing it (it needs torchvision)."""
     spec = importlib.util.find_spec("lpips")
     for folder in (spec.submodule_search_locations if spec else None) or ():
-        path = Path(folder, "weights", "v0.1", "alex.pth")
+        path = Path(folder, "weights", "v0.1", HEADS_FILE)
         if path.is_file():
             return path
     return None
-
-
-def _package_weights(alexnet: Path, heads: Path) -> Weights:
-    """The arrays of `_RANKS` from torchvision's AlexNet and the lpips package's linear weights."""
-    convolutions, linear = _load_state(alexnet), _load_state(heads)
-    weights: Weights = {}
-    try:
-        for i, layer in enumerate(_TORCHVISION_LAYERS, start=1):
-            for part in ("weight", "bias"):
-                weights[f"conv{i}.{part}"] = convolutions[f"features.{layer}.{part}"].numpy()
-        for i in range(5):
-            weights[f"lin{i}"] = linear[f"lin{i}.model.1.weight"].numpy().reshape(-1)
-    except KeyError as error:
-        raise SplashbenchError(f"{alexnet} or {heads} lacks {error}; give --lpips-weights") from None
-    return weights
-
-
-def _load_state(path: Path) -> dict[str, Any]:
-    import pickle
-
-    import torch
-
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise SplashbenchError(f"{path} cannot be read ({error}); restore it, or give --lpips-weights") from None

@@ -11,6 +11,7 @@ from splashbench.scene.geometry import STEPS_PER_VOXEL
 from splashbench_methods.splashsplat.carriers.between import carriers_at, steadiness
 from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.motion.between import moved_distance
 from splashbench_methods.splashsplat.motion.steps import Motion
 
 SHAPE = (24, 24, 64)
@@ -132,3 +133,28 @@ def test_steady_is_what_keeps_its_place():
     )
     assert rests[12, 12, 20] == pytest.approx(1)
     assert flies[12, 12, 46] == flies[12, 12, 26] == 0
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+def test_a_drops_surface_is_where_the_drop_is(share: float):
+    # It falls by 10 voxels and is 8 wide: half way it is in neither frame's place.
+    before, after = (np.clip(ball(height, 4) * STEPS_PER_VOXEL, -127, 127).astype(np.int8) for height in (40.0, 30.0))
+    velocities = np.zeros((1, 8, 8, 18, 3), dtype=np.float16)
+    velocities[..., 2] = -10
+    step = Motion(velocities, 4, [None]).step(0)
+    moved = moved_distance(before, after, step, share)
+    inside = np.argwhere(moved < 0)
+    assert len(inside) == pytest.approx((ball(40, 4) < 0).sum(), rel=0.15)
+    np.testing.assert_allclose(inside.mean(axis=0), [12, 12, 40 - 10 * share], atol=0.3)
+    blended = (1 - share) * before.astype(float) + share * after
+    assert (blended < 0).sum() < 0.6 * len(inside)
+
+
+def test_liquid_that_one_frame_has_alone_shrinks_between_them():
+    before = np.clip(ball(32) * STEPS_PER_VOXEL, -127, 127).astype(np.int8)
+    nothing = np.full_like(before, 127)
+    step = Motion(np.zeros((1, 8, 8, 18, 3), dtype=np.float16), 4, [None]).step(0)
+    sizes = [int((moved_distance(before, nothing, step, share) < 0).sum()) for share in (0.0, 0.1, 0.3, 0.6)]
+    assert sizes[0] == (before < 0).sum()
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] == 0

@@ -1,0 +1,224 @@
+"""`splashbench view`: look at a scene, a submission or two, in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splashbench.cli.arguments import image_size, whole_number
+from splashbench.cli.command import add_command
+from splashbench.cli.output import emit, say
+from splashbench.errors import SplashbenchError
+
+if TYPE_CHECKING:
+    from splashbench.viewer.viewer import Viewer
+
+_EPILOG = """\
+examples:
+  splashbench view scenes/bowl_001
+  splashbench view submissions/bowl_001/splashsplat --scene scenes/bowl_001
+  splashbench view submissions/a submissions/b              side by side, with one camera
+  splashbench view scenes/bowl submissions/a --no-open      a reconstruction beside its scene
+  splashbench view submissions/a --screenshot view.png --camera 3 --time 0.8
+  splashbench view submissions/a --show particles cameras
+
+On a machine without a screen: run it there with --no-open, and on yours `ssh -L 8080:localhost:8080 MACHINE`, then open
+http://localhost:8080. Two halves take three ports, which the command names. It needs `pip install 'splashbench[view]'`.
+Layers for --show: liquid, background, particles, surface, cut, velocity, picture, container, points, cameras, grid.
+"""
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = add_command(
+        subparsers,
+        "view",
+        run,
+        summary="look at a scene or submissions in a browser, at any speed",
+        description="Show a scene, a submission, or two side by side in a browser, and play them at any speed.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument(
+        "places", type=Path, nargs="+", metavar="SCENE|SUBMISSION", help="one folder, or two to see side by side"
+    )
+    parser.add_argument(
+        "--scene", type=Path, metavar="SCENE", help="the scene of the submissions: photographs, and the container"
+    )
+    parser.add_argument("--method", metavar="FILE.py:CLASS", help="a submission's method that is not installed")
+    parser.add_argument("--time", type=_seconds, metavar="SECONDS", help="start at the timestep nearest to this time")
+    parser.add_argument("--camera", metavar="NAME", help="with --screenshot: look through this camera")
+    parser.add_argument("--show", nargs="+", metavar="LAYER", help="show these layers at first, and no others")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, this machine alone)"
+    )
+    parser.add_argument(
+        "--port", type=whole_number(1, 65535), metavar="N", help="port to listen on (default: the first free from 8080)"
+    )
+    parser.add_argument("--no-open", action="store_true", help="open no browser; the address is printed")
+    parser.add_argument(
+        "--save-to", type=Path, metavar="FOLDER", help="for screenshots and camera paths (default: the browser's own)"
+    )
+    parser.add_argument(
+        "--screenshot", type=Path, metavar="OUT.png", help="write what a headless browser shows, and end"
+    )
+    parser.add_argument(
+        "--size", type=image_size, default=(1200, 800), metavar="WxH", help="of the screenshot (default: 1200x800)"
+    )
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds")
+    return seconds
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench view`."""
+    if len(arguments.places) > 2:
+        arguments.usage_error(f"two can be seen side by side, not {len(arguments.places)}")
+    if arguments.camera and not arguments.screenshot:
+        arguments.usage_error("--camera is for --screenshot; in the browser choose one in the panel")
+    if arguments.screenshot:
+        _require_picture_place(arguments.screenshot)
+    if arguments.save_to:
+        from splashbench.files import require_folder_place
+
+        require_folder_place(arguments.save_to)
+    from splashbench.viewer.server import is_loopback, require_viser
+
+    require_viser()
+    from splashbench.viewer.exhibit import SceneExhibit, open_exhibit
+    from splashbench.viewer.panel import Panel
+    from splashbench.viewer.viewer import Viewer
+
+    exhibits = [open_exhibit(place, arguments.scene, _method_of(place, arguments.method)) for place in arguments.places]
+    if arguments.camera:
+        exhibits[0].camera(arguments.camera)
+    if arguments.scene and all(isinstance(exhibit, SceneExhibit) for exhibit in exhibits):
+        say("--scene is for submissions, and none was given; it is not used")
+    viewer = Viewer(
+        exhibits,
+        "127.0.0.1" if arguments.screenshot else arguments.host,
+        None if arguments.screenshot else arguments.port,
+        send_ahead=False if arguments.screenshot else None,
+        on=arguments.show,
+        save_to=arguments.save_to,
+    )
+    try:
+        if not arguments.screenshot:
+            Panel(viewer)
+        if arguments.time is not None:
+            viewer.seek(exhibits[0].nearest(arguments.time))
+        viewer.start()
+        if arguments.screenshot:
+            return _screenshot(viewer, arguments)
+        if not is_loopback(arguments.host):
+            say(f"warning: listening on {arguments.host}, so anybody on the network can look and press the buttons")
+        _tell(viewer, arguments)
+        viewer.run()
+    finally:
+        viewer.stop()
+    return 0
+
+
+def _method_of(place: Path, method: str | None) -> str | None:
+    """`method`, FILE.py:CLASS, where the submission in `place` is of it: of two, one may be of an installed method."""
+    if method is None:
+        return None
+    from splashbench.harness.discovery import load_method
+    from splashbench.submission import Submission
+
+    own = load_method(method).id
+    try:
+        return method if Submission.open(place, verify=False).identity.method == own else None
+    except SplashbenchError:  # a scene, or nothing at all, which is found when it is opened
+        return None
+
+
+def _require_picture_place(path: Path) -> None:
+    from splashbench.files import require_file_place
+
+    if path.suffix.lower() != ".png":
+        raise SplashbenchError(f"{path} would be written as PNG; end its name in .png")
+    require_file_place(path)
+
+
+def _screenshot(viewer: Viewer, arguments: argparse.Namespace) -> int:
+    from splashbench.files import write_png
+    from splashbench.viewer.still import still
+
+    image = still(viewer, arguments.size, arguments.camera)
+    write_png(arguments.screenshot, image)
+    say(f"wrote {arguments.screenshot} ({image.shape[1]}x{image.shape[0]})")
+    if arguments.json:
+        emit(_facts(viewer) | {"file": str(arguments.screenshot), "size": [image.shape[1], image.shape[0]]})
+    return 0
+
+
+def _facts(viewer: Viewer) -> dict[str, object]:
+    exhibit = viewer.halves[0].stage.exhibit
+    return {
+        "shown": [
+            {
+                "folder": str(half.stage.exhibit.place),
+                "name": half.stage.exhibit.name,
+                "layers": list(half.stage.layers),
+            }
+            for half in viewer.halves
+        ],
+        "timesteps": exhibit.n_frames,
+        "seconds": float(exhibit.times[-1] - exhibit.times[0]),
+    }
+
+
+def _tell(viewer: Viewer, arguments: argparse.Namespace) -> None:
+    from splashbench.viewer.server import DEFAULT_PORT
+
+    for half in viewer.halves:
+        exhibit = half.stage.exhibit
+        span = f"{exhibit.n_frames} timesteps in {exhibit.times[-1] - exhibit.times[0]:.3g} s"
+        say(f"{exhibit.place}: {exhibit.name}, {span}, {len(exhibit.cameras)} cameras")
+    if arguments.port is None and viewer.port != DEFAULT_PORT:
+        say(f"port {DEFAULT_PORT} is in use; this is {viewer.port}")
+    opens = not arguments.no_open and _has_screen()
+    others = [half.server.get_port() for half in viewer.halves if half.server.get_port() != viewer.port]
+    if arguments.json:
+        emit(_facts(viewer) | {"address": viewer.address, "ports": [viewer.port, *others]})
+        _flush()
+    say(f"look at {viewer.address}{f' (and ports {others[0]}, {others[1]})' if others else ''}; Ctrl-C ends it")
+    if opens:
+        _open(viewer.address)
+
+
+def _flush() -> None:
+    """What reads the address waits for it while the command runs on."""
+    import sys
+
+    sys.stdout.flush()
+
+
+def _has_screen() -> bool:
+    """Whether a browser can be opened: without a screen it would be one of text, and take the terminal."""
+    import os
+
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return True
+    say("there is no screen here to open a browser on; open the address yourself")
+    return False
+
+
+def _open(address: str) -> None:
+    import webbrowser
+
+    try:
+        opened = webbrowser.open(address)
+    except webbrowser.Error:
+        opened = False
+    if not opened:
+        say("no browser could be opened; open the address yourself")
