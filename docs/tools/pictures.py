@@ -23,11 +23,13 @@ from scipy import ndimage
 
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
+from splashbench.dyes import DYES
 from splashbench.errors import SplashbenchError
 from splashbench.replay import load
 from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.report.results import ResultFile
+from splashbench.restyle import filmed_dye, restyled
 from splashbench.scene import Scene
 from splashbench.score.metrics import METRICS
 from splashbench.score.result import Digests, Result, metric_value
@@ -36,7 +38,7 @@ from splashbench.study.perturbations import KINDS, Dice, Recording, Step, pertur
 from splashbench.study.perturbations.setup import MissingCameras
 from splashbench.study.perturbations.timesteps import FewerTimesteps
 from splashbench.study.scenes import recording_of
-from splashbench.submission import Submission
+from splashbench.submission import Submission, to_8bit
 from splashbench.video import TRUTH, Comparison, VideoSettings, make_film
 from splashbench.video.layers import LAYERS
 from splashbench_methods.splashsplat.fields.container import known_container
@@ -407,6 +409,24 @@ def videos() -> list[Path]:
     ]
 
 
+def dyes() -> list[Path]:
+    """The picture of docs/restyling.md: three pours as reconstructed and with every dye that has a name."""
+    rows = []
+    for name, dye, frame in (("opaque_bowl", "blue", 18), ("glass_tank", "amber", 16), ("clear_liquid", "amber", 16)):
+        scene, fit = WORK / f"{name}_{dye}", WORK / "submissions" / f"{name}_{dye}"
+        made(scene, "synth", "scene", name, str(scene), "--size", "600x400", "--timesteps", "24", "--dye", dye)
+        filmed = load(made(fit, "run", "splashsplat", str(scene), str(fit)))
+        time, found = float(filmed.times[frame]), filmed_dye(filmed)
+        shown = [filmed, *(restyled(filmed, dye, filmed=found) for dye in DYES.values())]
+        views = [one.render(VIEW, time) for one in shown]
+        top, left = (int(np.median(where)) for where in np.nonzero(views[0].alpha > 0.5))
+        crop = slice(int(np.clip(top - 120, 0, 160)), None), slice(int(np.clip(left - 110, 0, 380)), None)
+        rows.append(np.concatenate([view.rgb[crop][:240, :220] for view in views], axis=1))
+    path = IMAGES / "dyes.jpg"
+    Image.fromarray(to_8bit(np.concatenate(rows))).save(path, quality=84, optimize=True)
+    return [path]
+
+
 #: What `main` draws, by name.
 GROUPS: dict[str, Callable[[], list[Path]]] = {
     "chart": chart,
@@ -417,6 +437,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "perturbations": perturbations,
     "tutorial": tutorial,
     "videos": videos,
+    "dyes": dyes,
 }
 
 if __name__ == "__main__":

@@ -229,9 +229,9 @@ def test_what_a_submission_does_not_hold_is_asked_for(fit: Path) -> None:
 @pytest.mark.parametrize(
     ("method", "few"),
     [
-        ("spacetime_gaussians_lite", {"iterations": 20}),
+        pytest.param("spacetime_gaussians_lite", {"iterations": 20}, marks=pytest.mark.slow),
         ("spacetime_gaussians", {"iterations": 20}),
-        ("deformable_3dgs", {"iterations": 20}),
+        pytest.param("deformable_3dgs", {"iterations": 20}, marks=pytest.mark.slow),
         ("scaffold_4d", {"iterations": 20}),
     ],
 )

@@ -136,3 +136,12 @@ def test_a_mask_of_the_wrong_size_ends_scoring_without_a_result(
     reseal(submission)
     assert "seg/6/000002.png" in fails("score", submission, "--scene", balls_copy, "--out", tmp_path / "results")
     assert not (tmp_path / "results").exists()
+
+
+def test_results_do_not_go_into_a_sealed_submission(submission: Path, balls_directory: Path, fails: Fails) -> None:
+    before = sorted(path.name for path in submission.iterdir())
+    for option, place in (("--out", submission / "results"), ("--sheet", submission / "sheet.png")):
+        words = ["--out", submission.parent / "results"] if option == "--sheet" else []
+        line = fails("score", submission, "--scene", balls_directory, *words, option, place)
+        assert "whose files are sealed" in line
+    assert sorted(path.name for path in submission.iterdir()) == before
