@@ -52,7 +52,8 @@ QUICK := $(addprefix tests/test_, alignment.py architecture.py files.py manifest
   restyle/test_filmed_dye.py scene/test_camera.py \
   score/test_score_neighbours.py score/test_score_notation.py score/test_score_protocol.py \
   selfcalibration/test_exposure.py study/test_study_table.py \
-  submission/test_submission.py synth/test_synth_audio.py video/test_video_parts.py)
+  submission/test_submission.py synth/test_synth_audio.py video/test_video_parts.py \
+  viewer/test_viewer_clock.py viewer/test_viewer_splats.py)
 quick-test: .venv/installed-test
 	@echo "==> Running the quick tests"
 	$(BIN)/python -m pytest -q -m "not slow and not cuda" -n auto --maxprocesses=2 --dist=loadfile $(QUICK)

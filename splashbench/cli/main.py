@@ -39,6 +39,7 @@ the usual order:
   splashbench run splashsplat SCENE SUBMISSION      reconstruct
   splashbench explain SUBMISSION                    why the fit is as large and as slow as it is
   splashbench download lpips-weights                once: the network weights of the metric LPIPS
+  splashbench view SUBMISSION --scene SCENE         look at it in a browser, at any speed
   splashbench video SUBMISSION OUT.mp4              look at it, from anywhere and at any speed
   splashbench export SUBMISSION OUT --format mesh   for Blender, SuperSplat, numpy
   splashbench score SUBMISSION --scene SCENE --out RESULTS

@@ -109,6 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
         send_ahead=False if arguments.screenshot else None,
         on=arguments.show,
         save_to=arguments.save_to,
+        makes_ahead=not arguments.screenshot,
     )
     try:
         if not arguments.screenshot:

@@ -49,6 +49,8 @@ class CameraLayer(Layer):
         self._photograph, self._n_frames, self._size, self._clicked = photograph, n_frames, size, clicked
         each = math.sqrt(_CACHE_BYTES / (3 * n_frames * len(cameras)))
         self._side = int(np.clip(each, _SMALLEST, _LARGEST))
+        # Timesteps whose photographs are kept: of long recordings those nearest to the shown one.
+        self._most = max(2, _CACHE_BYTES // (3 * self._side**2 * len(cameras)))
         self._small: dict[int, dict[str, NDArray[np.uint8] | None]] = {}
         self._nodes: dict[str, tuple[Any, Any]] = {}
         self._shown: int | None = None
@@ -86,7 +88,7 @@ class CameraLayer(Layer):
 
     def ahead(self, moment: Moment) -> Job | None:
         """The next photograph that is missing."""
-        if not self.on:
+        if not self.on or len(self._small) >= self._most:
             return None
         jobs = (self._missing((moment.t + k) % self._n_frames) for k in range(self._n_frames))
         return next((job for job in jobs if job is not None), None)
@@ -100,6 +102,8 @@ class CameraLayer(Layer):
         image = self._photograph(name, t)
         with self._lock:
             self._small.setdefault(t, {})[name] = None if image is None else smaller(image, self._side)
+            if len(self._small) > self._most:
+                del self._small[max(self._small, key=lambda other: abs(other - t))]
 
     def _build(self) -> None:
         nodes = {}
@@ -140,7 +144,8 @@ class CameraLayer(Layer):
     def loading(self) -> tuple[int, int] | None:
         """Timesteps whose photographs are there, and T."""
         there = sum(len(small) == len(self._cameras) for small in self._small.values())
-        return (there, self._n_frames) if self.on and there < self._n_frames else None
+        wanted = min(self._n_frames, self._most)
+        return (there, wanted) if self.on and there < wanted else None
 
 
 def smaller(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:

@@ -107,6 +107,7 @@ class Exhibit(ABC):
     def extent(self) -> Extent:
         """Where the liquid is, about."""
         points = self._some_points()
+        points = None if points is None else points[np.isfinite(points).all(axis=1)]
         if points is not None and len(points):
             low, high = np.percentile(points, [100 - _MOST_OF_IT, _MOST_OF_IT], axis=0)
             if (high - low).max() > 0:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from threading import RLock
 from typing import Any
 
+#: Scene nodes of a layer that are kept, at the most: of longer recordings those nearest to the shown timestep.
+MOST_NODES = 500
 #: A piece of work for the worker's thread.
 Job = Callable[[], None]
 
@@ -159,7 +161,7 @@ class TimedLayer(Layer):
 
     def ahead(self, moment: Moment) -> Job | None:
         """The next node after `moment` that is missing."""
-        if not self.on:
+        if not self.on or len(self._nodes) >= MOST_NODES:
             return None
         later = ((moment.t + k) % self._n_frames for k in range(self._n_frames))
         missing = next((t for t in later if t not in self._nodes), None)
@@ -169,10 +171,17 @@ class TimedLayer(Layer):
         version = self._version
         node = self._make(t)
         with self._lock:
-            if version == self._version:
-                self._nodes[t] = node
-            elif node is not None:
-                node.remove()
+            if version != self._version:
+                if node is not None:
+                    node.remove()
+                return
+            self._nodes[t] = node
+            if len(self._nodes) > MOST_NODES:
+                farthest = max(self._nodes, key=lambda other: abs(other - t))
+                gone = self._nodes.pop(farthest)
+                self._visible = None if gone is self._visible else self._visible
+                if gone is not None:
+                    gone.remove()
 
     def settings_changed(self, moment: Moment) -> None:
         """Remove every node."""
@@ -186,7 +195,8 @@ class TimedLayer(Layer):
     @property
     def loading(self) -> tuple[int, int] | None:
         """Nodes that are there, and T."""
-        return (len(self._nodes), self._n_frames) if self.on and len(self._nodes) < self._n_frames else None
+        wanted = min(self._n_frames, MOST_NODES)
+        return (len(self._nodes), wanted) if self.on and len(self._nodes) < wanted else None
 
     @property
     def remark(self) -> str:

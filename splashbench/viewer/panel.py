@@ -24,7 +24,7 @@ SENDING = {
     "all timesteps at once": True,
     "one timestep at a time": False,
 }
-_NO_CAMERA = "free"
+_NO_CAMERA = "(none)"
 _REFRESH_SECONDS = 0.25
 
 

@@ -9,14 +9,20 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
-from typing import Any
+import warnings
+from collections.abc import Callable
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from splashbench.errors import SplashbenchError
 
+T = TypeVar("T")
+
 DEFAULT_PORT = 8080
 # Ports that are tried, from the default one, where the user names none.
 _TRIED = 50
+# Ports that other programs may take between the look and the use.
+_RACES = 10
 INSTALL = "pip install 'splashbench[view]'"
 
 
@@ -30,8 +36,8 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def free_port(host: str, wanted: int | None, taken: tuple[int, ...] = ()) -> int:
-    """`wanted`, or the first free port from DEFAULT_PORT where that is None, `taken` ones left out.
+def free_port(host: str, wanted: int | None, start: int | None = None) -> int:
+    """`wanted`, or where that is None the first free port from `start`, by default from DEFAULT_PORT.
 
     Raises SplashbenchError where `wanted` is in use, none is free, or `host` is no address of this machine.
     """
@@ -41,11 +47,10 @@ def free_port(host: str, wanted: int | None, taken: tuple[int, ...] = ()) -> int
         raise SplashbenchError(
             f"--host {host} is no address ({error.strerror or error}); give one of this machine's"
         ) from None
-    ports = [wanted] if wanted is not None else range(DEFAULT_PORT, DEFAULT_PORT + _TRIED)
+    first = wanted or start or DEFAULT_PORT
+    ports = range(first, 1 + (first if wanted is not None else min(first + _TRIED - 1, 65535)))
     fault: OSError | None = None
     for port in ports:
-        if port in taken:
-            continue
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             # As servers do: a port that a program left a moment ago is free.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -58,15 +63,33 @@ def free_port(host: str, wanted: int | None, taken: tuple[int, ...] = ()) -> int
                     break
     if fault is not None and not _is_in_use(fault):
         raise SplashbenchError(
-            f"cannot listen on {host}, port {ports[0]} ({fault.strerror}); give another --host or --port"
+            f"cannot listen on {host}, port {first} ({fault.strerror}); give another --host or --port"
         )
     if wanted is not None:
         raise SplashbenchError(f"port {wanted} is in use; give another --port, or none and the next free one is taken")
-    raise SplashbenchError(f"ports {DEFAULT_PORT} to {DEFAULT_PORT + _TRIED - 1} are in use; give another by --port")
+    raise SplashbenchError(f"ports {first} to {first + _TRIED - 1} are in use; give another by --port")
 
 
 def _is_in_use(error: OSError) -> bool:
     return error.errno == errno.EADDRINUSE
+
+
+class PortTaken(SplashbenchError):
+    """Another program took a port that was free a moment ago."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(f"port {port} was taken by another program meanwhile; run the command again")
+
+
+def on_free_port(host: str, wanted: int | None, start: int | None, listen: Callable[[int], T]) -> T:
+    """What `listen` returns for a port, see `free_port`. Where another program is faster, the next one is tried."""
+    for left in reversed(range(_RACES)):
+        try:
+            return listen(free_port(host, wanted, start))
+        except PortTaken:
+            if wanted is not None or not left:
+                raise
+    raise AssertionError("no race is left")
 
 
 def is_own_page(headers: Any, loopback: bool) -> bool:
@@ -94,7 +117,7 @@ def require_viser() -> None:
 def start_server(host: str, port: int, label: str) -> Any:
     """viser's server on `host` and `port`, which are free. label: the panel's heading.
 
-    Raises SplashbenchError where viser is not installed, or another program took the port meanwhile.
+    Raises SplashbenchError where viser is not installed, PortTaken where another program took the port meanwhile.
     """
     require_viser()
     import rich
@@ -107,10 +130,12 @@ def start_server(host: str, port: int, label: str) -> Any:
             return None
 
     rich.reconfigure(quiet=True)  # its banner would go to standard output, between the lines of --json
+    # Of browsers that go away while something is sent to them.
+    warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
     server = QuietServer(host=host, port=port, label=label, verbose=False)
     if server.get_port() != port:
         server.stop()
-        raise SplashbenchError(f"port {port} was taken by another program meanwhile; run the command again")
+        raise PortTaken(port)
     loopback = is_loopback(host)
     sockets = server._websock_server
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.scene import Gaussians
-from splashbench.viewer.layers import Job, Layer, Moment
+from splashbench.viewer.layers import MOST_NODES, Job, Layer, Moment
 from splashbench.viewer.merging import Lookout, merged
 from splashbench.viewer.splats import PackedGaussians, pack, sound, unit_of
 
@@ -83,7 +83,7 @@ class SplatLayer(Layer):
     def set_send_ahead(self, ahead: bool, moment: Moment) -> None:
         """Send all timesteps, or one at a time."""
         with self._lock:
-            self._send_ahead = ahead
+            self._send_ahead = ahead = ahead and self._n_frames <= MOST_NODES
             if not ahead:
                 for node in self._nodes.values():
                     node.remove()

@@ -31,6 +31,8 @@ MOST_BACKGROUND = 200_000
 MOST_ARROWS = 500
 # Triangles of the surface, all timesteps together: what a browser holds besides the rest.
 _MOST_FACES = 4_000_000
+# Nodes of the grid that it is made from.
+_MOST_NODES = 16_000_000
 # The longest arrows (95th percentile of the first timestep) as a share of the liquid's extent.
 _ARROW = 0.08
 # How far before a camera its photograph hangs, as a share of the way to the liquid.
@@ -282,18 +284,22 @@ class Stage:
         distance = self.exhibit.distance(t)
         if distance is None:
             return None
-        mesh = surface_mesh(coarser(distance, self._stride or 1))
+        # A grid of a stranger's may have any number of nodes.
+        least = math.ceil((distance.phi[0].size / _MOST_NODES) ** (1 / 3))
+        mesh = surface_mesh(coarser(distance, max(self._stride or 1, least)))
         if not len(mesh.faces):
             return None
         most = _MOST_FACES / self.exhibit.n_frames
         if self._stride is None:
             # Triangles grow as the square of the nodes along a side.
-            self._stride = max(1, math.ceil(math.sqrt(len(mesh.faces) / most)))
-            mesh = surface_mesh(coarser(distance, self._stride)) if self._stride > 1 else mesh
+            self._stride = least * max(1, math.ceil(math.sqrt(len(mesh.faces) / most)))
+            mesh = surface_mesh(coarser(distance, self._stride)) if self._stride > least else mesh
         return self._mesh(f"surface/timestep {t}", mesh.vertices, mesh.faces, _LIQUID_COLOR, 0.85)
 
     def _surface_remark(self) -> str:
-        return f"The surface is made from every {self._stride}. node." if (self._stride or 1) > 1 else ""
+        return (
+            f"The surface is made from one node in {self._stride} along each axis." if (self._stride or 1) > 1 else ""
+        )
 
     def _mesh(self, name: str, vertices: NDArray, faces: NDArray, color: tuple[int, int, int], opacity: float) -> Any:
         return self._scene.add_mesh_simple(

@@ -38,7 +38,7 @@ def still(viewer: Viewer, size: tuple[int, int], camera: str | None = None) -> N
         if camera is not None:
             viewer.go_to_camera(client, camera)
         viewer.settle(at_once=True)
-        if not viewer.wait_idle(_MADE_SECONDS):
+        if not viewer.wait_ready(_MADE_SECONDS):
             raise SplashbenchError(f"the scene was not made within {_MADE_SECONDS:g} s; show fewer layers")
         return _settled(viewer, client)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -18,7 +19,7 @@ from splashbench.viewer.geometry import View, client_picture, client_view, view_
 from splashbench.viewer.half import Half
 from splashbench.viewer.keyframes import FPS, MOST_KEYFRAMES, Keyframe, path_through
 from splashbench.viewer.layers import Layer, Moment
-from splashbench.viewer.server import address_of, free_port, start_server
+from splashbench.viewer.server import address_of, free_port, on_free_port, start_server
 from splashbench.viewer.window import WindowServer
 from splashbench.viewer.worker import Worker
 
@@ -69,6 +70,7 @@ class Viewer:
         send_ahead: whether all timesteps are sent at once; None: to clients that draw fast.
         on: names of the layers that are shown at first; None: what suits each exhibit.
         save_to: the folder for screenshots and paths; None: the browser saves them.
+        makes_ahead: whether what may be shown later is made, too.
 
     Raises SplashbenchError where it cannot listen, exhibits do not go together, or a layer's name is unknown.
     """
@@ -81,7 +83,9 @@ class Viewer:
         send_ahead: bool | None = None,
         on: Sequence[str] | None = None,
         save_to: Path | None = None,
+        makes_ahead: bool = True,
     ) -> None:
+        self._makes_ahead = makes_ahead
         if len(exhibits) == 2:
             require_same_rig(*exhibits)
         try:
@@ -96,22 +100,14 @@ class Viewer:
         self._changed = threading.Event()
         self._shown: tuple[int, bool] | None = None
         self._looked_through: str | None = None
-        self.port = free_port(host, port)
-        ports = [self.port]
         self._window: WindowServer | None = None
         self._servers: list[Any] = []
         try:
-            if len(exhibits) == 2:
-                for _ in exhibits:
-                    ports.append(free_port(host, None, tuple(ports)))
-                self._window = WindowServer(host, self.port, ports[1:], [exhibit.name for exhibit in exhibits])
-                ports = ports[1:]
-            self.halves: list[Half] = []
-            for number, at in enumerate(ports):
-                self._servers.append(start_server(host, at, "splashbench" if number == 0 else exhibits[number].name))
-                self.halves.append(
-                    Half(self._servers[-1], exhibits, number, self._clicked, self._moved, self._connected)
-                )
+            self.port = self._serve(exhibits, port)
+            self.halves = [
+                Half(server, exhibits, number, self._clicked, self._moved, self._connected)
+                for number, server in enumerate(self._servers)
+            ]
             if on is not None:
                 self._choose_layers(on)
         except BaseException:
@@ -121,12 +117,30 @@ class Viewer:
             for stage in half.stages:
                 stage.send_ahead(bool(send_ahead))
         self._worker = Worker(self._next_job)
-        self._faults: set[str] = set()
+        # Whether all of what is shown is made; how often somebody said that there may be more to make.
+        self._ready, self._ready_lock, self._calls = threading.Event(), threading.Lock(), 0
 
     @property
     def address(self) -> str:
         """Where a browser on this machine finds it."""
         return address_of(self._host, self.port)
+
+    def _serve(self, exhibits: Sequence[Exhibit], port: int | None) -> int:
+        """Start a server for each exhibit, and before two of them the window with both; returns the port to open."""
+        names = [exhibit.name for exhibit in exhibits]
+        if len(exhibits) == 1:
+            self._servers.append(on_free_port(self._host, port, None, partial(self._server, "splashbench")))
+            return int(self._servers[0].get_port())
+        start = free_port(self._host, port) + 1
+        for label in ("splashbench", names[1]):
+            self._servers.append(on_free_port(self._host, None, start, partial(self._server, label)))
+            start = self._servers[-1].get_port() + 1
+        ports = [server.get_port() for server in self._servers]
+        self._window = on_free_port(self._host, port, None, lambda free: WindowServer(self._host, free, ports, names))
+        return self._window.port
+
+    def _server(self, label: str, port: int) -> Any:
+        return start_server(self._host, port, label)
 
     def _choose_layers(self, names: Sequence[str]) -> None:
         known = [name for half in self.halves for stage in half.stages for name in stage.layers]
@@ -159,7 +173,7 @@ class Viewer:
     def settle(self, at_once: bool = False) -> None:
         """Make what is shown for where clients look from, once they have been there for a moment."""
         if any([half.settle(at_once) for half in self.halves]):  # noqa: C419 (each of them)
-            self._worker.wake()
+            self._wake()
 
     def tick(self) -> None:
         """Show the timestep whose turn it is."""
@@ -170,7 +184,7 @@ class Viewer:
         for half in self.halves:
             half.stage.show(self._moment(half))
         self.display.show_time(t, self.clock.seconds, playing)
-        self._worker.wake()
+        self._wake()
 
     def _moment(self, half: Half) -> Moment:
         """What the half shows: its exhibit's timestep nearest to the clock's time."""
@@ -179,11 +193,22 @@ class Viewer:
     def changed(self) -> None:
         """Something was changed by hand: look at the clock, at what is missing and at what is said."""
         self._changed.set()
-        self._worker.wake()
+        self._wake()
         self.display.refresh()
 
+    def _wake(self) -> None:
+        """There may be something to make."""
+        with self._ready_lock:
+            self._calls += 1
+            self._ready.clear()
+        self._worker.wake()
+
+    def wait_ready(self, seconds: float) -> bool:
+        """Wait until all of what is shown is made, for `seconds` at the most; whether it is."""
+        return self._ready.wait(seconds)
+
     def wait_idle(self, seconds: float) -> bool:
-        """Wait until everything that is shown is made, for `seconds` at the most; whether it is."""
+        """Wait until what may be shown later is made, too."""
         return self._worker.wait_idle(seconds)
 
     def stop(self) -> None:
@@ -191,6 +216,7 @@ class Viewer:
         if self._path_played is not None:
             self._path_played.set()
         self._worker.stop()
+        self._ready.set()  # whoever waits need not wait longer
         self._stop_servers()
 
     def _stop_servers(self) -> None:
@@ -200,10 +226,17 @@ class Viewer:
             self._window.stop()
 
     def _next_job(self) -> Callable[[], None] | None:
+        calls = self._calls
         for urgent in (True, False):
             for half in self.halves:
                 for layer, job in half.stage.jobs(urgent):
                     return lambda half=half, layer=layer, job=job: self._work(half, layer, job)  # type: ignore[misc]
+            if urgent:
+                with self._ready_lock:
+                    if calls == self._calls:  # else there may be more by now
+                        self._ready.set()
+            if not self._makes_ahead:
+                break
         self.display.refresh()
         return None
 
@@ -296,7 +329,7 @@ class Viewer:
             for each in half.clients():
                 if each is client or half is not self._half_of(client):
                     half.set_view(each, view)
-        self._worker.wake()
+        self._wake()
 
     def _look_through(self, name: str | None) -> None:
         if name != self._looked_through:
@@ -319,16 +352,16 @@ class Viewer:
                 if other is not half:
                     for follower in other.clients():
                         other.set_view(follower, view)
-        self._worker.wake()
+        self._wake()
 
     def _connected(self, half: Half, client: Any) -> None:
         if self._send_ahead is None:
             self._probe(half, client)
-        self._worker.wake()
+        self._wake()
 
     def _probe(self, half: Half, client: Any) -> None:
         """Send all timesteps to the half whose `client` draws fast what is there."""
-        self.wait_idle(_MADE_SECONDS)
+        self.wait_ready(_MADE_SECONDS)
         seconds = []
         for _ in range(_PROBES):
             start = time.monotonic()
@@ -340,7 +373,7 @@ class Viewer:
         if self._send_ahead is None:
             for stage in half.stages:
                 stage.send_ahead(min(seconds) < _FAST_SECONDS)
-            self._worker.wake()
+            self._wake()
 
     # Screenshots and camera paths.
 

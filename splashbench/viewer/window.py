@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from typing import Any
 
-from splashbench.errors import SplashbenchError
+from splashbench.viewer.server import PortTaken
 
 #: Pixels of the panel that is docked in the left half.
 PANEL_WIDTH = 320
@@ -62,12 +62,11 @@ class WindowServer:
             daemon_threads = True
             address_family = _family(host)
 
+        self.port = port
         try:
             self._server = Server((host, port), Exchange)
         except OSError as error:
-            raise SplashbenchError(
-                f"port {port} was taken by another program meanwhile ({error.strerror}); try again"
-            ) from None
+            raise PortTaken(port) from error
         Thread(target=self._server.serve_forever, name="viewer window", daemon=True).start()
 
     def stop(self) -> None:

@@ -17,9 +17,9 @@ class Worker:
 
     def __init__(self, next_job: NextJob) -> None:
         self._next_job = next_job
-        self._something = threading.Event()
-        self._idle = threading.Event()
-        self._stopped = False
+        self._state = threading.Condition()
+        # Whether somebody has called since it last asked for work; whether it found none; whether it is to end.
+        self._called, self._idle, self._stopped = True, False, False
         self._thread = threading.Thread(target=self._run, name="viewer worker", daemon=True)
 
     def start(self) -> None:
@@ -28,28 +28,36 @@ class Worker:
 
     def wake(self) -> None:
         """There may be something to do."""
-        self._idle.clear()
-        self._something.set()
+        with self._state:
+            self._called, self._idle = True, False
+            self._state.notify_all()
 
     def wait_idle(self, seconds: float) -> bool:
         """Wait until there is nothing to do, for `seconds` at the most; whether that came."""
-        return self._idle.wait(seconds)
+        with self._state:
+            return self._state.wait_for(lambda: self._idle or self._stopped, seconds)
 
     def stop(self) -> None:
         """End after the present piece of work; waits a moment for it."""
-        self._stopped = True
-        self._something.set()
-        self._idle.set()  # whoever waits need not wait longer
+        with self._state:
+            self._stopped = True
+            self._state.notify_all()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
     def _run(self) -> None:
-        while not self._stopped:
-            self._something.clear()
+        while True:
+            with self._state:
+                self._called = False
+                if self._stopped:
+                    return
             job = self._next_job()
             if job is not None:
-                self._idle.clear()
                 job()
-            elif not self._something.is_set():
-                self._idle.set()
-                self._something.wait()
+                continue
+            with self._state:
+                # A call that came while it looked for work may be of work that it did not see.
+                if not self._called:
+                    self._idle = True
+                    self._state.notify_all()
+                    self._state.wait_for(lambda: self._called or self._stopped)

@@ -19,6 +19,13 @@ def test_the_first_pages_pictures_are_small() -> None:
     assert all(path.name in (ROOT / "README.md").read_text(encoding="utf-8") for path in pictures)
 
 
+def test_the_viewers_picture_is_small_and_on_the_first_page() -> None:
+    picture = ROOT / "docs" / "images" / "viewer.png"
+    assert picture.stat().st_size < README_BYTES
+    assert imageio.imread(picture).shape[1] == 1200
+    assert picture.name in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
 def test_the_chart_is_drawn_from_the_leaderboard(tmp_path: Path) -> None:
     pictures = runpy.run_path(str(ROOT / "docs" / "tools" / "pictures.py"))
     chart: Any = pictures["chart"]

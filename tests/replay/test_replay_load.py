@@ -232,7 +232,7 @@ def test_what_a_submission_does_not_hold_is_asked_for(fit: Path) -> None:
         pytest.param("spacetime_gaussians_lite", {"iterations": 20}, marks=pytest.mark.slow),
         ("spacetime_gaussians", {"iterations": 20}),
         pytest.param("deformable_3dgs", {"iterations": 20}, marks=pytest.mark.slow),
-        ("scaffold_4d", {"iterations": 20}),
+        pytest.param("scaffold_4d", {"iterations": 20}, marks=pytest.mark.slow),
     ],
 )
 def test_methods_of_one_set_of_gaussians_tell_their_liquid_apart(
