@@ -89,12 +89,12 @@ def _told(found: dict) -> str:
     unit = "per metre" if found["metric"] else "per metre, if the longest ways through the liquid are 25 mm"
 
     def three(values: list[float]) -> str:
-        return ", ".join(f"{value:.3g}" for value in values)
+        return ", ".join(f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in values)
 
     if found["opaque"]:
         return (
             f"the filmed liquid is opaque, {found['thick_layers']}: its density cannot be known (red, green and blue "
-            f"are absorbed by {three(found['absorption_at_least'])} {unit} or more)"
+            f"are absorbed by {three(found['absorption_at_least'])} {unit} or more); --density opaque keeps it opaque"
         )
     low, high = found["absorption_low"], found["absorption_high"]
     ranges = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high))

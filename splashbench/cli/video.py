@@ -93,7 +93,7 @@ def _add_times(parser: argparse.ArgumentParser) -> None:
     )
     speed = times.add_mutually_exclusive_group()
     speed.add_argument(
-        "--slow", type=positive_number("times"), metavar="N", help="N times slower than real (default: 1)"
+        "--slow", type=_number("times", 1e-3, 1e12), metavar="N", help="N times slower than real (default: 1)"
     )
     speed.add_argument(
         "--seconds",

@@ -84,6 +84,12 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.usage_error(f"two can be seen side by side, not {len(arguments.places)}")
     if arguments.camera and not arguments.screenshot:
         arguments.usage_error("--camera is for --screenshot; in the browser choose one in the panel")
+    from splashbench.submission import IDENTITY, require_outside
+
+    sealed = [place for place in arguments.places if (place / IDENTITY).is_file()]
+    for output in (arguments.screenshot, arguments.save_to):
+        if output is not None:
+            require_outside(output, *sealed)
     if arguments.screenshot:
         _require_picture_place(arguments.screenshot)
     if arguments.save_to:

@@ -48,7 +48,7 @@ class Reconstruction:
 
     def __repr__(self) -> str:
         identity = self.submission.identity
-        span = f"{len(self.times)} timesteps in {self.times[-1] - self.times[0]:.3g} s"
+        span = f"{len(self.times)} timesteps from {self.times[0]:.3f} to {self.times[-1]:.3f} s"
         cameras = f"{len(self.train)} training and {len(self.test)} test cameras"
         return f"<Reconstruction {identity.method} ({identity.preset}) of {identity.scene}: {span}, {cameras}>"
 
@@ -115,8 +115,13 @@ class Reconstruction:
         distances = self._distances
         if distances is None:
             return None
-        if len(self.times) == 1 or distances.n_frames != len(self.times):
-            t, share = int(np.abs(self.times - time).argmin()), 0.0
+        if distances.n_frames != len(self.times):
+            raise SplashbenchError(
+                f"{self.submission.directory / 'geometry.npz'} has {distances.n_frames} instants, and its scene "
+                f"{len(self.times)} timesteps; run the method again"
+            )
+        if len(self.times) == 1:
+            t, share = 0, 0.0
         else:
             inside = float(np.clip(time, self.times[0], self.times[-1]))
             t = int(np.clip(np.searchsorted(self.times, inside, side="right") - 1, 0, len(self.times) - 2))
@@ -145,7 +150,7 @@ def load(
         verify: whether files must have the digests that SHA256SUMS states.
         method: `FILE.py:CLASS` of a method that is not installed, which runs its code.
 
-    Example: `splashbench.load("submissions/bowl").render("3", time=0.25).rgb` is an image [H, W, 3] in [0, 1].
+    Example: `splashbench.load("submissions/bowl").render("3", time=2.5).rgb` is an image [H, W, 3] in [0, 1].
 
     Raises SplashbenchError for a folder that is no submission, a run that failed, a method that is not installed, a
     scene that is another, or files that are damaged.

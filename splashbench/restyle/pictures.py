@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import atomic_directory, atomic_path, write_json, write_png
 from splashbench.progress import track
 from splashbench.replay import Reconstruction
 from splashbench.restyle.filmed_dye import FilmedDye
 from splashbench.restyle.relighting import Buffers, Restyled, metres_per_unit
 from splashbench.srgb import to_srgb
-from splashbench.submission import to_8bit
+from splashbench.submission import require_earlier, to_8bit
 
 #: What marks a folder as one of these, which may be replaced.
 DYE_FILE = "dye.json"
@@ -38,6 +39,7 @@ def write_restyled(
     """
     model = dyed.fitted
     assert isinstance(model, Restyled)
+    require_earlier(out, DYE_FILE, {"filmed"})
     views = [(name, t) for name in cameras for t in range(len(dyed.times))]
     with atomic_directory(out, replace=replace, holds=DYE_FILE, inputs=[dyed.submission.directory]) as staging:
         for name, t in track(views, "restyling", total=len(views)):
@@ -75,7 +77,10 @@ def write_buffers(path: Path, buffers: Buffers) -> None:
     channels |= {name: np.ascontiguousarray(values, np.float32) for name, values in full.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary, OpenEXR.File(header, channels) as file:
-        file.write(str(temporary))
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:  # of the library, which also says so of a full disk
+            raise SplashbenchError(f"{path} could not be written ({one_line(str(error))}); free some space") from None
 
 
 def filmed_facts(reconstruction: Reconstruction, filmed: FilmedDye) -> dict[str, Any]:

@@ -31,6 +31,8 @@ _SHADING = (0.3, 3.0)
 # Of the shading, what is kept where all light comes through the liquid: there it is of the background as well.
 _KEPT_SEEN_THROUGH = 0.5
 _LEAST_LIGHT = 1e-3
+# Below this opacity the liquid's own light is not told from noise.
+_LEAST_COVER = 0.1
 # The liquid's outline is the carriers'; where no ray meets the surface beside it, what is nearest to it counts.
 _LEAST_OPACITY = 1 / 255
 
@@ -84,17 +86,21 @@ class Restyled(Fitted):
     def _relit(self, light: Image, alpha: Image, background: Image, interface: Interface, camera: Camera) -> Image:
         filmed = self.filmed
         through = seen_through(background, interface, camera, filmed.index)
-        mirrored = reflectance(facing(interface, camera))[..., None]
+        cover = alpha[..., None]
+        # The liquid alone: at its outline the picture is of both, and what was filmed must not stay there.
+        liquid = np.maximum((light - (1 - cover) * background) / np.maximum(cover, _LEAST_COVER), 0)
+        # The room in the surface is no brighter than what was filmed there: a normal that says so is wrong.
+        most = liquid.min(-1, keepdims=True) / max(filmed.mirrored, _LEAST_LIGHT)
+        mirrored = np.minimum(reflectance(facing(interface, camera))[..., None], most)
         passed = transmittance(interface.length, filmed.absorption) if not filmed.opaque else np.zeros_like(light)
         before = self._explained(through, mirrored, passed, filmed.returned)
         returned = self.light * self.new.albedo.astype(np.float64)
         after = self._explained(through, mirrored, transmittance(interface.length, self.new.absorption), returned)
-        cover = alpha[..., None]
-        highlight = np.maximum((light - ((1 - cover) * background + cover * before)).min(-1, keepdims=True), 0)
-        shading = (light - highlight).sum(-1, keepdims=True) / np.maximum(before.sum(-1, keepdims=True), _LEAST_LIGHT)
+        highlight = np.maximum((liquid - before).min(-1, keepdims=True), 0)
+        shading = (liquid - highlight).sum(-1, keepdims=True) / np.maximum(before.sum(-1, keepdims=True), _LEAST_LIGHT)
         kept = 1 - (1 - _KEPT_SEEN_THROUGH) * passed.mean(-1, keepdims=True)
-        shaded = after * np.clip(shading, *_SHADING) ** kept
-        return np.asarray((1 - cover) * light + cover * (highlight + shaded), np.float32)
+        dyed = highlight + after * np.clip(shading, *_SHADING) ** kept
+        return np.where(cover > _LEAST_OPACITY, (1 - cover) * background + cover * dyed, light).astype(np.float32)
 
     def _explained(self, through: Image, mirrored: Image, passed: Image, returned: NDArray[np.float64]) -> Image:
         """Light [H, W, 3] of liquid that lets `passed` of the background through and returns `returned` of its own."""

@@ -47,7 +47,7 @@ class SceneViews(BaseModel):
     times: _Times
     times_source: str = Field(max_length=100)
     gravity: list[_Number] | None = Field(default=None, min_length=3, max_length=3)
-    metres_per_unit: float | None = Field(default=None, gt=0, le=1e9, allow_inf_nan=False)
+    metres_per_unit: float | None = Field(default=None, ge=1e-9, le=1e9, allow_inf_nan=False)
     container_transparent: bool | None = None
     is_released: bool = False
     cameras: list[_View] = Field(min_length=1, max_length=_MAX_CAMERAS)
@@ -95,6 +95,26 @@ def read_cameras(directory: Path) -> AbsentScene | None:
     return AbsentScene(path, read_model(path, SceneViews)) if path.is_file() else None
 
 
+def _require_sense(path: Path, views: SceneViews) -> None:
+    """Raise SplashbenchError for what each field allows and all of them together do not."""
+    names = [view.name for view in views.cameras]
+    faults = {
+        "two cameras have one name": len(set(names)) < len(names),
+        "there is no training camera, or no test camera": len({view.test for view in views.cameras}) < 2,
+        "a K is not that of a pinhole without skew": any(
+            [len(row) for row in view.K] != [3, 3, 3] or view.K[2] != [0, 0, 1] or view.K[0][1] or view.K[1][0]
+            for view in views.cameras
+        ),
+        "a w2c does not end in 0 0 0 1": any(
+            [len(row) for row in view.w2c] != [4] * 4 or view.w2c[3] != [0, 0, 0, 1] for view in views.cameras
+        ),
+        "gravity has no direction": views.gravity is not None and not np.linalg.norm(views.gravity) > 1e-6,
+    }
+    for fault, found in faults.items():
+        if found:
+            raise SplashbenchError(f"{path}: {fault}; run the method again")
+
+
 class AbsentScene(TrainingScene):
     """A scene of which a submission knows cameras and times alone: images and masks are elsewhere."""
 
@@ -103,6 +123,7 @@ class AbsentScene(TrainingScene):
         self.name, self.directory = views.scene, path.parent
         self.train = tuple(view.name for view in views.cameras if not view.test)
         self.test = tuple(view.name for view in views.cameras if view.test)
+        _require_sense(path, views)
         try:
             cameras = {
                 view.name: Camera(view.name, view.width, view.height, np.array(view.K), np.array(view.w2c))
@@ -117,7 +138,7 @@ class AbsentScene(TrainingScene):
         self.frames = tuple(f"{t:06d}" for t in range(self.n_frames))
         self.times_source = views.times_source
         own = {view.name: self.times if view.times is None else np.array(view.times) for view in views.cameras}
-        if any(times.shape != self.times.shape for times in own.values()) or (np.diff(self.times) <= 0).any():
+        if any(times.shape != self.times.shape or (np.diff(times) <= 0).any() for times in own.values()):
             raise SplashbenchError(f"{path}: its times do not rise, or cameras differ in their number; run again")
         self.camera_times = own
         self.gravity = None if views.gravity is None else np.array(views.gravity)

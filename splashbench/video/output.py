@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,7 +18,7 @@ from splashbench.files import (
     write_json,
 )
 from splashbench.progress import track
-from splashbench.submission import require_outside
+from splashbench.submission import require_earlier, require_outside
 from splashbench.video.encoders import Encoder, PngFolder, encode_gif, encode_mp4, gif_rate
 from splashbench.video.film import Film
 from splashbench.video.timing import DEFAULT_FPS
@@ -48,11 +49,14 @@ def require_place(out: Path, replace: bool, submissions: Sequence[Path]) -> None
     require_outside(out, *submissions)
     if folder:
         require_folder_place(out)
+        require_earlier(out, FRAMES, {"frames", "fps", "times"})
         if out.is_dir() and any(out.iterdir()) and not replace:
             raise SplashbenchError(f"{out} exists already; give another place, or --replace to replace it")
         return
     require_file_place(out)
-    if out.exists() and not replace:
+    if out.exists() and not out.is_file():
+        raise SplashbenchError(f"{out} is a device or pipe; give the name of a file")
+    if os.path.lexists(out) and not replace:
         raise SplashbenchError(f"{out} exists already; give another place, or --replace to replace it")
 
 

@@ -205,3 +205,25 @@ def test_a_video_that_is_stopped_leaves_nothing(name: str, points: Path, tmp_pat
     assert said.strip().endswith("interrupted; nothing half-written was left")
     assert "Traceback" not in said
     assert list(place.iterdir()) == []
+
+
+def test_a_folder_that_is_no_earlier_video_stays(
+    points: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "mine"
+    place.mkdir()
+    (place / "frames.json").write_text("[1]")
+    (place / "thesis.txt").write_text("years")
+    assert main(["video", str(points), str(place), "--timesteps", "--replace"]) == 1
+    assert "frames.json is of something else" in capsys.readouterr().err
+    assert (place / "thesis.txt").read_text() == "years"
+    (tmp_path / "link.mp4").symlink_to("nowhere")
+    assert main(["video", str(points), str(tmp_path / "link.mp4")]) == 1
+    os.mkfifo(tmp_path / "pipe.mp4")
+    assert main(["video", str(points), str(tmp_path / "pipe.mp4"), "--replace"]) == 1
+
+
+@pytest.mark.parametrize("slow", ["1e308", "1e-320", "0", "nan"])
+def test_an_absurd_speed_is_wrong_usage(slow: str, points: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        main(["video", str(points), str(tmp_path / "a.mp4"), "--slow", slow])

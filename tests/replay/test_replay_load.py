@@ -13,7 +13,7 @@ import splashbench
 from splashbench.errors import SplashbenchError
 from splashbench.harness.oracle import write_oracle
 from splashbench.harness.runner import run_method
-from splashbench.scene import Scene
+from splashbench.scene import Scene, SignedDistance
 from splashbench.submission import Record, Status, Submission, seal, to_8bit
 from splashbench.submission.cameras import CAMERAS
 
@@ -251,3 +251,37 @@ def test_methods_of_one_set_of_gaussians_tell_their_liquid_apart(
     np.testing.assert_allclose(alpha, opened.render(camera, time).alpha, atol=1e-4)
     with pytest.raises(SplashbenchError, match="masks of scene"):
         splashbench.load(tmp_path / method).render(camera, time)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda facts: [view.update(test=True) for view in facts["cameras"]], "no training camera"),
+        (lambda facts: [view.update(test=False) for view in facts["cameras"]], "no test camera"),
+        (lambda facts: [view.update(name="1") for view in facts["cameras"]], "one name"),
+        (lambda facts: facts["cameras"][0]["K"][0].__setitem__(1, 5.0), "without skew"),
+        (lambda facts: facts["cameras"][0]["K"].__setitem__(2, [7, 7, 0]), "without skew"),
+        (lambda facts: facts["cameras"][0]["w2c"].__setitem__(3, [5, 5, 5, 0]), "0 0 0 1"),
+        (lambda facts: facts.update(gravity=[0, 0, 0]), "gravity"),
+        (lambda facts: facts["cameras"][0].update(times=facts["times"][::-1]), "do not rise"),
+        (lambda facts: facts.update(metres_per_unit=1e-300), "metres_per_unit"),
+    ],
+)
+def test_cameras_that_make_no_sense_together_are_told(copy: Path, change: object, fault: str) -> None:
+    facts = json.loads((copy / CAMERAS).read_text())
+    change(facts)  # type: ignore[operator]
+    (copy / CAMERAS).write_text(json.dumps(facts))
+    with pytest.raises(SplashbenchError, match=fault) as caught:
+        splashbench.load(copy, verify=False)
+    assert "cameras.json" in str(caught.value)
+
+
+def test_geometry_of_other_timesteps_is_told(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = splashbench.load(copy)
+    geometry = opened.submission.geometry()
+    assert geometry is not None
+    short = SignedDistance(geometry.phi[:1], geometry.origin, geometry.voxel)
+    monkeypatch.setattr(opened.fitted, "surface", lambda time: None)
+    monkeypatch.setattr(opened.submission, "geometry", lambda: short)
+    with pytest.raises(SplashbenchError, match=r"geometry\.npz has 1 instants, and its scene 8"):
+        opened.surface(0.1)

@@ -9,8 +9,11 @@ import pytest
 
 from splashbench.dyes import DYES, Dye, dye_named
 from splashbench.errors import SplashbenchError
+from splashbench.harness.contract import Render
 from splashbench.replay import Reconstruction
 from splashbench.restyle import FilmedDye, filmed_dye, restyled
+from splashbench.scene import Camera
+from splashbench.srgb import to_linear, to_srgb
 
 from .conftest import OPAQUE, ROOM, Ball, of
 
@@ -115,3 +118,15 @@ def test_a_color_is_what_comes_through_25_mm() -> None:
     np.testing.assert_allclose(to_srgb(np.exp(-dye.absorption * 0.025)) * 255, [0xC0, 0x80, 0x40], atol=1)
     assert (dye_named("#ffffff").absorption >= 0).all()
     assert np.isfinite(dye_named("#000000").absorption).all()
+
+
+def test_what_was_filmed_does_not_stay_where_the_liquid_covers_half_a_pixel(blue: Dye) -> None:
+    class Half(Ball):
+        def render(self, camera: Camera, time: float) -> Render:
+            made, behind = super().render(camera, time), self.empty_view(camera)
+            light = 0.5 * to_linear(made.rgb) + 0.5 * to_linear(behind)
+            return Render(to_srgb(light), 0.5 * made.alpha)
+
+    thick, brown = Dye(blue.albedo, OPAQUE), Dye(DYES["brown"].albedo, OPAQUE)
+    _, dyed = compared(Half(thick), Half(brown), known(thick, opaque=True), density=np.inf)
+    assert dyed > 35

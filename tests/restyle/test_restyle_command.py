@@ -76,6 +76,9 @@ def test_what_is_there_stays(fit: Path, tmp_path: Path, capsys: pytest.CaptureFi
     (place / "thesis.txt").write_text("years")
     assert main(["restyle", str(fit), str(place), "--dye", "green"]) == 1
     assert main(["restyle", str(fit), str(place), "--dye", "green", "--replace"]) == 1
+    (place / "dye.json").write_text('{"recipe": "of wool"}')
+    assert main(["restyle", str(fit), str(place), "--dye", "green", "--replace"]) == 1
+    assert "dye.json is of something else" in capsys.readouterr().err
     assert (place / "thesis.txt").read_text() == "years"
     assert main(["restyle", str(fit), str(fit / "dyed"), "--dye", "green"]) == 1
     capsys.readouterr()
