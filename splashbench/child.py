@@ -18,10 +18,9 @@ from splashbench.processes import end_with_parent
 
 # With `python -m` and `python -c` the current folder comes first among those that are imported from, and a downloaded
 # one may hold a json.py. So the parent's folders are set before anything is imported.
-_START = (
-    "import sys; sys.path[:] = sys.argv[1].split({separator!r}); del sys.argv[1]; "
-    "from splashbench.child import main; sys.exit(main(*sys.argv[1:]))"
-)
+_START = "import sys; sys.path[:] = sys.argv[1].split({separator!r}); del sys.argv[1]; {then}"
+_TASK = "from splashbench.child import main; sys.exit(main(*sys.argv[1:]))"
+_TOOL = "from splashbench.cli.main import main; sys.exit(main())"
 #: Exit code of a child that could not write; the last line of its log says which file.
 DISK_FULL_EXIT = 28
 
@@ -29,9 +28,17 @@ DISK_FULL_EXIT = 28
 def child_command(task: Callable[..., int], *arguments: str | Path) -> list[str]:
     """The command line of a child process of this one that carries out `task(*arguments)`."""
     name = f"{task.__module__}:{task.__qualname__}"
+    return [*_start(_TASK), str(os.getpid()), name, *map(str, arguments)]
+
+
+def tool_command(*words: str | Path) -> list[str]:
+    """The command line `splashbench WORDS...` as a process that imports from where this one does."""
+    return [*_start(_TOOL), *map(str, words)]
+
+
+def _start(then: str) -> list[str]:
     folders = os.pathsep.join(folder for folder in sys.path if folder)  # "" would be wherever the child is
-    start = [sys.executable, "-c", _START.format(separator=os.pathsep), folders]
-    return [*start, str(os.getpid()), name, *map(str, arguments)]
+    return [sys.executable, "-c", _START.format(separator=os.pathsep, then=then), folders]
 
 
 def raise_if_disk_was_full(exit_code: int | None, log: Sequence[str]) -> None:

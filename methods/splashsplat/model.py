@@ -75,6 +75,7 @@ class Liquid:
     composition: Composition = "over"
     between_frames: BetweenFrames = "both"
     arrays: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    _surface: tuple[float, SignedDistance] | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -149,12 +150,17 @@ class Liquid:
 
     def surface(self, time: float) -> SignedDistance:
         """phi at `time` (seconds), one instant: each frame's around it moved there by u_t, blended by nearness."""
+        # One instant's is asked for several times: for a picture, and for where a velocity is of the liquid.
+        if self._surface is not None and self._surface[0] == time:
+            return self._surface[1]
         t, fraction = locate(self.times, time)
         phi = self.phi[t : t + 1]
         if fraction != 0:
             first, share = (t, fraction) if fraction > 0 else (t - 1, 1 + fraction)
             phi = moved_distance(self.phi[first], self.phi[first + 1], self.motion.step(first), share)[None]
-        return SignedDistance(phi, self.grid.origin, self.grid.voxel)
+        surface = SignedDistance(phi, self.grid.origin, self.grid.voxel)
+        self._surface = time, surface
+        return surface
 
     def velocity(self, time: float) -> VelocityField | None:
         """u_t of the step that `time` (seconds) lies in, on every second node; None where it moved no carrier."""

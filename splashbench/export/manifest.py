@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from splashbench.errors import SplashbenchError
 from splashbench.export.placement import Placement, Up
-from splashbench.files import atomic_directory, read_model, write_model
+from splashbench.files import atomic_directory, write_model
 from splashbench.replay import Reconstruction
 from splashbench.submission import require_outside
 from splashbench.version import __version__
@@ -73,16 +73,8 @@ def export_folder(reconstruction: Reconstruction, out: Path | str, replace: bool
     """
     out, submission = Path(out), reconstruction.submission.directory
     require_outside(out, submission)
-    if replace and (out / MANIFEST).is_file():
-        # Many programs have a file of that name.
-        try:
-            read_model(out / MANIFEST, Manifest)
-        except SplashbenchError:
-            raise SplashbenchError(
-                f"{out} is no earlier export (its {MANIFEST} is of something else) and stays; give another place"
-            ) from None
     inputs = [submission, *([reconstruction.scene.directory] if reconstruction.scene else [])]
-    with atomic_directory(out, replace, holds=MANIFEST, inputs=inputs) as staging:
+    with atomic_directory(out, replace, holds=MANIFEST, keys=Manifest.model_fields, inputs=inputs) as staging:
         yield staging
 
 

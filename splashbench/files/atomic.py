@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import errno
+import json
+import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files.places import require_file_place, require_folder_place
 
+# Of the file that marks an output: a video's has a time for each frame.
+_MAX_MARKER_BYTES = 16_000_000
 _STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-")
 
 
@@ -33,19 +37,23 @@ def as_asked(path: Path | str) -> str:
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `path`. Success renames it onto `path`; failure removes it."""
+def atomic_path(path: Path, replace: bool = True) -> Iterator[Path]:
+    """Yield a temporary sibling of `path`. Success renames it onto `path`; failure removes it.
+
+    replace: whether what is at `path` may go, in the end too: another process may have written it meanwhile.
+    """
     path = Path(path)
-    require_file_place(path)
+    require_file_place(path, replace)
     made_parent = not path.parent.exists()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(path)
     done = False
     try:
         yield temporary
+        require_file_place(path, replace)
         temporary.replace(path)
         done = True
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise_if_disk_full(path, error)
         raise
     finally:
@@ -59,13 +67,14 @@ def raise_if_disk_full(path: Path | str, error: Exception) -> None:
     """Raise DiskFullError where `error` says that the disk is full; libraries report it in several ways."""
     if isinstance(error, DiskFullError):
         raise error
-    if not isinstance(error, OSError):
-        return
-    no_room = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    number, text = getattr(error, "errno", None), str(error)
+    no_room = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     # Pillow's encoders and numpy's tofile drop the system's error number; only their messages tell of a failed write.
-    text = str(error)
-    library_failed = error.errno is None and (
-        "when writing image file" in text or ("requested and" in text and "written" in text)
+    # OpenEXR raises a RuntimeError with the system's words.
+    library_failed = number is None and (
+        "when writing image file" in text
+        or ("requested and" in text and "written" in text)
+        or os.strerror(errno.ENOSPC) in text
     )
     if no_room or library_failed:
         raise DiskFullError(
@@ -75,19 +84,25 @@ def raise_if_disk_full(path: Path | str, error: Exception) -> None:
 
 @contextmanager
 def atomic_directory(
-    path: Path, replace: bool = False, *, holds: str | None = None, inputs: Sequence[Path] = ()
+    path: Path,
+    replace: bool = False,
+    *,
+    holds: str | None = None,
+    keys: Collection[str] = (),
+    inputs: Sequence[Path] = (),
 ) -> Iterator[Path]:
     """Yield a temporary sibling directory. Success renames it to `path`; failure removes it.
 
     Args:
         replace: whether what is at `path` may go; an empty directory counts as absent.
         holds: a file that every output of this kind has; a directory without it is never replaced.
+        keys: that `holds`, a JSON object, has in every output; for a name that other programs may use.
         inputs: what the output is made from; a place that holds one of them is never replaced.
 
     Raises SplashbenchError where there is something at `path` that may not be replaced.
     """
     path = Path(path).resolve()  # a link stays; its target is replaced
-    _require_replaceable(path, replace, holds, inputs)
+    _require_replaceable(path, replace, holds, keys, inputs)
     require_folder_place(path.parent if path.exists() else path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(path)
@@ -96,7 +111,7 @@ def atomic_directory(
         temporary.mkdir()
         yield temporary
         # Checked again: another process may have written `path` meanwhile.
-        _require_replaceable(path, replace, holds, inputs)
+        _require_replaceable(path, replace, holds, keys, inputs)
         if path.exists():
             path.rename(retired)
         temporary.rename(path)
@@ -111,7 +126,9 @@ def atomic_directory(
             shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _require_replaceable(path: Path, replace: bool, holds: str | None, inputs: Sequence[Path]) -> None:
+def _require_replaceable(
+    path: Path, replace: bool, holds: str | None, keys: Collection[str], inputs: Sequence[Path]
+) -> None:
     """Raise SplashbenchError unless an output may take the place `path`, resolved."""
     for source in inputs:
         if Path(source).resolve().is_relative_to(path):
@@ -124,6 +141,21 @@ def _require_replaceable(path: Path, replace: bool, holds: str | None, inputs: S
         raise SplashbenchError(f"{path} is a file; give the name of a folder")
     if holds is not None and not (path / holds).is_file():
         raise SplashbenchError(f"{path} is no earlier output (it has no {holds}) and stays; give another place")
+    if holds is not None and keys and not _has_keys(path / holds, keys):
+        raise SplashbenchError(
+            f"{path} is no earlier output (its {holds} is of something else) and stays; give another place"
+        )
+
+
+def _has_keys(path: Path, keys: Collection[str]) -> bool:
+    """Whether `path` is a JSON object that has all of `keys`."""
+    try:
+        if path.stat().st_size > _MAX_MARKER_BYTES:
+            return False
+        data = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(data, dict) and set(keys) <= set(data)
 
 
 @contextmanager

@@ -8,11 +8,19 @@ from pathlib import Path
 from splashbench.errors import SplashbenchError
 
 
-def require_file_place(path: Path) -> None:
-    """Raise SplashbenchError where no file can be written at `path`; called before long work."""
-    if Path(path).is_dir():
+def require_file_place(path: Path, replace: bool = True) -> None:
+    """Raise SplashbenchError where no file can be written at `path`; called before long work.
+
+    replace: whether a file that is there may go. A link that leads nowhere counts as one.
+    """
+    path = Path(path)
+    if path.is_dir():
         raise SplashbenchError(f"{path} is a folder; give the name of a file")
-    require_folder_place(Path(path).parent)
+    if path.exists() and not path.is_file():
+        raise SplashbenchError(f"{path} is a device or pipe; give the name of a file")
+    if not replace and os.path.lexists(path):
+        raise SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+    require_folder_place(path.parent)
 
 
 def require_folder_place(directory: Path) -> None:

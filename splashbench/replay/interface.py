@@ -35,13 +35,11 @@ class Interface:
             does not.
         normal: float32 [H, W, 3], unit vector out of the liquid where the ray enters it; 0 where it does not.
         length: float32 [H, W], how much of the ray lies in the liquid, scene units.
-        last: float32 [H, W], depth where the ray leaves the liquid for good; -inf where it does not meet it.
     """
 
     depth: NDArray[np.float32]
     normal: NDArray[np.float32]
     length: NDArray[np.float32]
-    last: NDArray[np.float32]
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -49,29 +47,23 @@ class Interface:
         return np.isfinite(self.depth)
 
 
-def cast(surface: SignedDistance, camera: Camera, t: int = 0, farthest: NDArray[np.float32] | None = None) -> Interface:
-    """The liquid of instant `t` of `surface` as `camera` sees it.
-
-    farthest: float32 [H, W], the depth at which rays end, such as that of what stands behind the liquid; none ends by
-    default.
-    """
+def cast(surface: SignedDistance, camera: Camera) -> Interface:
+    """The liquid of `surface`, which has one instant, as `camera` sees it. Raises ValueError for more."""
+    if surface.n_frames != 1:
+        raise ValueError(f"the surface has {surface.n_frames} instants, not one")
     size = (camera.height, camera.width)
-    depth, last = np.full(size, np.inf, np.float32), np.full(size, -np.inf, np.float32)
+    depth = np.full(size, np.inf, np.float32)
     normal, length = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
-    phi = np.ascontiguousarray(surface.phi[t])
+    phi = np.ascontiguousarray(surface.phi[0])
     if (phi < 0).any():
         directions = rays(camera)
         eye = (camera.center - surface.origin) / surface.voxel
-        ends = np.full(size, np.inf, np.float32) if farthest is None else np.ascontiguousarray(farthest, np.float32)
         low, high = liquid_box(phi)
-        over_range(
-            _cast, camera.height, phi, eye, directions, ends / surface.voxel, low, high, depth, normal, length, last
-        )
+        over_range(_cast, camera.height, phi, eye, directions, low, high, depth, normal, length)
     # Directions have a depth of 1, so that their parameter is the depth; their own length is a path's.
-    for values in (depth, last):
-        values *= np.float32(surface.voxel)
+    depth *= np.float32(surface.voxel)
     length *= np.float32(surface.voxel)
-    return Interface(depth, normal, length, last)
+    return Interface(depth, normal, length)
 
 
 def rays(camera: Camera) -> NDArray[np.float64]:
@@ -94,13 +86,11 @@ def _cast(
     phi: np.ndarray,
     eye: np.ndarray,
     directions: np.ndarray,
-    ends: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
     depth: np.ndarray,
     normal: np.ndarray,
     length: np.ndarray,
-    last: np.ndarray,
     start: int,
     stop: int,
 ) -> None:
@@ -108,7 +98,7 @@ def _cast(
         for column in range(directions.shape[1]):
             dx, dy, dz = directions[row, column, 0], directions[row, column, 1], directions[row, column, 2]
             # Where the ray is within the box.
-            near, far = 1e-6, ends[row, column]
+            near, far = 1e-6, np.inf
             for axis in range(3):
                 d = directions[row, column, axis]
                 if abs(d) < 1e-12:
@@ -155,7 +145,6 @@ def _cast(
                                 normal[row, column, 2] = gz / size
                     else:
                         length[row, column] += (crossing - entered) * speed
-                        last[row, column] = crossing
                     inside = not inside
                 if s >= far:
                     break
@@ -165,4 +154,3 @@ def _cast(
                 s = min(far, s + max(0.8 * abs(value) - 0.5, _STEP) / speed)
             if inside:
                 length[row, column] += (far - entered) * speed
-                last[row, column] = far

@@ -70,10 +70,19 @@ class Reconstruction:
     def render(self, camera: Camera | str, time: float) -> Render:
         """The view of `camera`, one of the scene's by name or any other, at `time` in seconds.
 
-        Any time within the recording will do, between timesteps too; beyond it the first or last timestep is shown.
-        Without a model, only test cameras by name at timesteps: anything else raises SplashbenchError.
+        Any time within the recording will do, between timesteps too; a step beyond either end the first or last
+        timestep is shown, and farther out SplashbenchError is raised. So it is for other cameras than the test cameras,
+        and between timesteps, where there is no model.
         """
+        self._require_recorded(time)
         return self.fitted.render(self.camera(camera) if isinstance(camera, str) else camera, float(time))
+
+    def _require_recorded(self, time: float) -> None:
+        """Raise SplashbenchError for a time that is not of the recording; cameras' own times may lie a step beyond."""
+        first, last = float(self.times[0]), float(self.times[-1])
+        step = float(np.diff(self.times).max()) if len(self.times) > 1 else 1.0
+        if not first - step <= time <= last + step:
+            raise SplashbenchError(f"{time:g} s is not of the recording, which lasts from {first:.3f} to {last:.3f} s")
 
     def empty_view(self, camera: Camera | str) -> NDArray[np.float32] | None:
         """What the view would be without liquid, float32 [H, W, 3], sRGB in [0, 1]; None where that is not known."""
@@ -81,6 +90,7 @@ class Reconstruction:
 
     def gaussians(self, time: float, eye: NDArray | None = None) -> Gaussians | None:
         """The liquid's Gaussians at `time`, coloured as seen from `eye` [3] (scene units; the cameras' mean place)."""
+        self._require_recorded(time)
         return self.fitted.gaussians(float(time), self.eye if eye is None else np.asarray(eye, dtype=np.float64))
 
     def static_gaussians(self, eye: NDArray | None = None) -> Gaussians | None:
@@ -109,6 +119,7 @@ class Reconstruction:
 
         Between timesteps it is the method's own, else the mean of the two around, weighted by nearness.
         """
+        self._require_recorded(time)
         made = self.fitted.surface(float(time))
         if made is not None:
             return made
@@ -135,6 +146,7 @@ class Reconstruction:
 
     def velocity(self, time: float) -> VelocityField | None:
         """The liquid's velocity at `time` on a grid, or None for a method without one."""
+        self._require_recorded(time)
         return self.fitted.velocity(float(time))
 
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from splashbench.errors import SplashbenchError, one_line
-from splashbench.files import atomic_directory, atomic_path, write_json, write_png
+from splashbench.files import atomic_directory, write_json, write_png
 from splashbench.progress import track
 from splashbench.replay import Reconstruction
 from splashbench.restyle.filmed_dye import FilmedDye
 from splashbench.restyle.relighting import Buffers, Restyled, metres_per_unit
 from splashbench.srgb import to_srgb
-from splashbench.submission import require_earlier, to_8bit
+from splashbench.submission import to_8bit
+from splashbench.submission.exr import write_channels
 
 #: What marks a folder as one of these, which may be replaced.
 DYE_FILE = "dye.json"
@@ -39,9 +39,9 @@ def write_restyled(
     """
     model = dyed.fitted
     assert isinstance(model, Restyled)
-    require_earlier(out, DYE_FILE, {"filmed"})
     views = [(name, t) for name in cameras for t in range(len(dyed.times))]
-    with atomic_directory(out, replace=replace, holds=DYE_FILE, inputs=[dyed.submission.directory]) as staging:
+    inputs = [dyed.submission.directory]
+    with atomic_directory(out, replace, holds=DYE_FILE, keys=("filmed",), inputs=inputs) as staging:
         for name, t in track(views, "restyling", total=len(views)):
             buffers = model.buffers(dyed.cameras[name], float(dyed.camera_times[name][t]))
             (staging / name).mkdir(exist_ok=True)
@@ -61,8 +61,6 @@ def write_buffers(path: Path, buffers: Buffers) -> None:
     `background.R/G/B` likewise; `depth.Z` along the optical axis and `length.Z` within the liquid, scene units, and
     `normal.X/Y/Z` in the scene's axes, as floats. Where no liquid is met, depth is infinite and the others are 0.
     """
-    import OpenEXR
-
     half = {
         **{name: buffers.rgb[..., c] for c, name in enumerate("RGB")},
         "A": buffers.alpha,
@@ -75,12 +73,7 @@ def write_buffers(path: Path, buffers: Buffers) -> None:
     }
     channels = {name: np.ascontiguousarray(values, np.float16) for name, values in half.items()}
     channels |= {name: np.ascontiguousarray(values, np.float32) for name, values in full.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with atomic_path(path) as temporary, OpenEXR.File(header, channels) as file:
-        try:
-            file.write(str(temporary))
-        except RuntimeError as error:  # of the library, which also says so of a full disk
-            raise SplashbenchError(f"{path} could not be written ({one_line(str(error))}); free some space") from None
+    write_channels(path, channels)
 
 
 def filmed_facts(reconstruction: Reconstruction, filmed: FilmedDye) -> dict[str, Any]:

@@ -31,6 +31,8 @@ _SHADING = (0.3, 3.0)
 # Of the shading, what is kept where all light comes through the liquid: there it is of the background as well.
 _KEPT_SEEN_THROUGH = 0.5
 _LEAST_LIGHT = 1e-3
+# Density of an opaque dye: by amber's red, the least that a named dye with a colour absorbs, .01 mm leave no light.
+_OPAQUE = 1e6
 # Below this opacity the liquid's own light is not told from noise.
 _LEAST_COVER = 0.1
 # The liquid's outline is the carriers'; where no ray meets the surface beside it, what is nearest to it counts.
@@ -136,13 +138,11 @@ def _completed(interface: Interface, alpha: Image, voxel: float) -> Interface:
         return interface
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
     rows, columns = nearest[0][lacking], nearest[1][lacking]
-    depth, normal, length, last = (
-        field.copy() for field in (interface.depth, interface.normal, interface.length, interface.last)
-    )
-    for field in (depth, normal, last):
+    depth, normal, length = (field.copy() for field in (interface.depth, interface.normal, interface.length))
+    for field in (depth, normal):
         field[lacking] = field[rows, columns]
     length[lacking] = voxel
-    return Interface(depth, normal, length, last)
+    return Interface(depth, normal, length)
 
 
 def metres_per_unit(reconstruction: Reconstruction, filmed: FilmedDye) -> float:
@@ -164,11 +164,15 @@ def restyled(
     """
     if not density >= 0 or not 0 < light < np.inf:
         raise ValueError(f"density {density:g} must be 0 or more and light {light:g} above 0")
-    require_optics(reconstruction)
-    filmed = filmed_dye(reconstruction) if filmed is None else filmed
-    absorption = dye.absorption * np.float32(metres_per_unit(reconstruction, filmed))
-    # Infinitely much of what a way of 0 absorbs is no number; this much is opaque within a hundredth of a voxel.
-    strength = min(density, 1e6)
-    return reconstruction.shown_by(
-        Restyled(reconstruction, filmed, Dye(dye.albedo, absorption * np.float32(strength)), light)
-    )
+    if np.isinf(density) and not dye.albedo.any():
+        raise SplashbenchError(
+            "a dye whose thick layers return no light, such as clear, cannot be opaque; give a density"
+        )
+    if filmed is None:
+        filmed = filmed_dye(reconstruction)
+    else:
+        require_optics(reconstruction)
+    # Not inf: of a way of 0 it would absorb what is no number.
+    strength = min(density, _OPAQUE) * metres_per_unit(reconstruction, filmed)
+    new = Dye(dye.albedo, dye.absorption * np.float32(strength))
+    return reconstruction.shown_by(Restyled(reconstruction, filmed, new, light))

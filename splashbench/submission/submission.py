@@ -13,7 +13,6 @@ SHA256SUMS                  of every other file
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,6 @@ from splashbench.files import (
     image_size,
     read_gray,
     read_image,
-    read_json,
     read_model,
     sha256_file,
     validate_model,
@@ -159,23 +157,6 @@ def require_outside(out: Path, *submissions: Path) -> None:
     for submission in submissions:
         if Path(out).resolve().is_relative_to(Path(submission).resolve()):
             raise SplashbenchError(f"{out} lies in {submission}, whose files are sealed; give a place outside it")
-
-
-def require_earlier(out: Path, marker: str, keys: Collection[str]) -> None:
-    """Raise SplashbenchError where `out` has a file `marker` that is not ours: JSON with at least `keys`.
-
-    Asked before a folder is replaced: many programs have a file of that name.
-    """
-    path = Path(out) / marker
-    if not path.is_file():
-        return
-    try:
-        data = read_json(path)
-        ours = isinstance(data, dict) and set(keys) <= set(data)
-    except SplashbenchError:
-        ours = False
-    if not ours:
-        raise SplashbenchError(f"{out} stays: its {marker} is of something else; give another place")
 
 
 def integrity_faults(directory: Path) -> list[str]:

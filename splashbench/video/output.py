@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,7 +17,7 @@ from splashbench.files import (
     write_json,
 )
 from splashbench.progress import track
-from splashbench.submission import require_earlier, require_outside
+from splashbench.submission import require_outside
 from splashbench.video.encoders import Encoder, PngFolder, encode_gif, encode_mp4, gif_rate
 from splashbench.video.film import Film
 from splashbench.video.timing import DEFAULT_FPS
@@ -49,15 +48,10 @@ def require_place(out: Path, replace: bool, submissions: Sequence[Path]) -> None
     require_outside(out, *submissions)
     if folder:
         require_folder_place(out)
-        require_earlier(out, FRAMES, {"frames", "fps", "times"})
         if out.is_dir() and any(out.iterdir()) and not replace:
             raise SplashbenchError(f"{out} exists already; give another place, or --replace to replace it")
         return
-    require_file_place(out)
-    if out.exists() and not out.is_file():
-        raise SplashbenchError(f"{out} is a device or pipe; give the name of a file")
-    if os.path.lexists(out) and not replace:
-        raise SplashbenchError(f"{out} exists already; give another place, or --replace to replace it")
+    require_file_place(out, replace)
 
 
 def default_fps(out: Path) -> float:
@@ -96,10 +90,11 @@ def _encoder(film: Film, out: Path, replace: bool) -> Iterator[Encoder]:
     if max(width, height) > MAX_SIDE:
         raise SplashbenchError(f"the video would be {width}x{height}, more than {MAX_SIDE} a side; give a --resize")
     if is_folder(out):
-        with atomic_directory(out, replace, holds=FRAMES, inputs=film.inputs) as staging:
+        keys = ("frames", "fps", "times")
+        with atomic_directory(out, replace, holds=FRAMES, keys=keys, inputs=film.inputs) as staging:
             yield PngFolder(staging)
             write_json(staging / FRAMES, film.about())
         return
     encode = encode_gif if out.suffix.lower() == ".gif" else encode_mp4
-    with atomic_path(out) as temporary, encode(temporary, (width, height), film.timing.fps) as encoder:
+    with atomic_path(out, replace) as temporary, encode(temporary, (width, height), film.timing.fps) as encoder:
         yield encoder

@@ -56,8 +56,6 @@ def test_what_is_hollow_is_no_way_through_liquid() -> None:
     shell = cast(field(np.maximum(ball(), -ball(RADIUS / 2))), CAMERA)
     inner = (hole > 4 * VOXEL) & (whole > 4 * VOXEL)
     assert np.abs(shell.length - (whole - hole))[inner].mean() < 0.2 * VOXEL
-    full = cast(field(ball()), CAMERA)
-    np.testing.assert_allclose(shell.last[inner], full.last[inner], atol=0.5 * VOXEL)
 
 
 def test_a_thin_sheet_is_not_stepped_over() -> None:
@@ -68,18 +66,6 @@ def test_a_thin_sheet_is_not_stepped_over() -> None:
     inside = (np.abs(at) < 0.24).all(-1) & (directions[..., 1] < 0)
     assert inside.sum() > 500
     assert found.seen[inside].all()
-
-
-def test_rays_end_where_something_stands() -> None:
-    everything = cast(field(ball()), CAMERA)
-    middle = float(CAMERA.project(CENTER[None])[1][0])
-    wall = np.full((CAMERA.height, CAMERA.width), middle, np.float32)
-    half = cast(field(ball()), CAMERA, farthest=wall)
-    inner = everything.length > RADIUS
-    assert (half.length[inner] < 0.7 * everything.length[inner]).all()
-    assert (half.last[half.seen] <= middle + 1e-5).all()
-    nowhere = cast(field(ball()), CAMERA, farthest=np.full_like(wall, 0.1))
-    assert not nowhere.seen.any()
 
 
 def test_a_camera_within_the_liquid_sees_it_from_the_start() -> None:
@@ -108,3 +94,9 @@ def test_it_does_not_depend_on_the_scenes_unit() -> None:
     again = cast(far, Camera("eye", 150, 100, CAMERA.K, w2c))
     np.testing.assert_allclose(again.length, 50 * once.length, atol=1e-3)
     np.testing.assert_array_equal(again.seen, once.seen)
+
+
+def test_a_surface_of_several_instants_is_refused() -> None:
+    one = field(ball())
+    with pytest.raises(ValueError, match="2 instants"):
+        cast(SignedDistance(np.concatenate([one.phi, one.phi]), one.origin, one.voxel), CAMERA)

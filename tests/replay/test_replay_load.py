@@ -101,7 +101,7 @@ def test_the_mean_of_two_timesteps(fit: Path, balls: Scene, monkeypatch: pytest.
     assert geometry is not None
     at = opened.surface(float(balls.times[2]))
     between = opened.surface(float(0.25 * balls.times[2] + 0.75 * balls.times[3]))
-    beyond = opened.surface(float(balls.times[-1]) + 9)
+    beyond = opened.surface(float(balls.times[-1]) + 0.01)
     assert at is not None
     assert between is not None
     assert beyond is not None
@@ -111,6 +111,15 @@ def test_the_mean_of_two_timesteps(fit: Path, balls: Scene, monkeypatch: pytest.
     assert np.abs(between.phi[0] - expected).max() <= 1
     sure = np.abs(expected) > 1e-6
     assert ((between.phi[0] < 0) == (expected < 0))[sure].all()
+
+
+@pytest.mark.parametrize("time", [-9.0, 99.0, float("nan"), float("inf")])
+def test_a_time_that_is_not_of_the_recording_is_told(fit: Path, time: float) -> None:
+    opened = splashbench.load(fit)
+    asks = (lambda: opened.render("6", time), lambda: opened.gaussians(time), lambda: opened.surface(time))
+    for ask in (*asks, lambda: opened.velocity(time)):
+        with pytest.raises(SplashbenchError, match="is not of the recording, which lasts from"):
+            ask()
 
 
 def test_without_a_model_there_are_the_stored_views(balls: Scene, tmp_path: Path) -> None:

@@ -130,3 +130,8 @@ def test_what_was_filmed_does_not_stay_where_the_liquid_covers_half_a_pixel(blue
     thick, brown = Dye(blue.albedo, OPAQUE), Dye(DYES["brown"].albedo, OPAQUE)
     _, dyed = compared(Half(thick), Half(brown), known(thick, opaque=True), density=np.inf)
     assert dyed > 35
+
+
+def test_clear_water_is_not_made_opaque(blue: Dye) -> None:
+    with pytest.raises(SplashbenchError, match="cannot be opaque"):
+        restyled(of(Ball(blue)), DYES["clear"], np.inf)

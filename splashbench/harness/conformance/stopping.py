@@ -13,13 +13,13 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splashbench.child import tool_command
 from splashbench.harness.conformance.evidence import SEED, Evidence, complete_fit
 from splashbench.harness.conformance.report import Judgement, Verdict, check, judge
 from splashbench.harness.contract import Fitted, Method, Run
@@ -144,7 +144,7 @@ def _stop(
     Without a signal it is left to the limit among its arguments. limit_seconds: for getting to the pause.
     """
     flag = Path(environment[_FLAG])
-    command = [sys.executable, "-m", "splashbench", "run", f"{__file__}:PausedMethod", *arguments]
+    command = tool_command("run", f"{__file__}:PausedMethod", *arguments)
     with log.open("wb") as stream:
         process = subprocess.Popen(
             command,
