@@ -75,8 +75,8 @@ def scenes(draw: st.DrawFn) -> tuple[list[np.ndarray], Camera, dict]:
 
 
 # As many scenes are looked at as are compared. Which they are also depends on the modules that are loaded, from whose
-# numbers hypothesis draws, so how many are worth something is counted.
-EXAMPLES, DRAWN, DOUBTFUL = 150, 50, 25
+# numbers hypothesis draws.
+EXAMPLES = 150
 
 
 @settings(max_examples=EXAMPLES, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -110,7 +110,7 @@ def test_images_and_gradients_match_the_definition(reference, scene):
 
 
 def test_the_random_scenes_are_worth_testing(reference):
-    """Enough of them draw something, and draw Gaussians that the pixel test calls doubtful."""
+    """Most of them draw something, and some draw Gaussians that the pixel test calls doubtful."""
     drawn, doubtful = 0, 0
 
     @settings(
@@ -129,5 +129,5 @@ def test_the_random_scenes_are_worth_testing(reference):
         doubtful += bool(reference.threshold_pixels(*tensors[:3], camera).any())
 
     look()
-    assert drawn > DRAWN
-    assert doubtful > DOUBTFUL
+    assert drawn > EXAMPLES * 0.5
+    assert doubtful > EXAMPLES * 0.2
