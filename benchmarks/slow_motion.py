@@ -10,8 +10,9 @@ rendered   each frame at its own time, by the method's own interpolation: what `
 held       the render of the last timestep, as a video of one picture per timestep shows
 faded      the renders of both timesteps around, blended by nearness
 
-For each the jitter (splashbench/video/flicker.py) at timesteps (`seams`), at the frames `between`, their ratio, and the
-mean over all frames, in levels of 255. All are taken over the pixels that the rendered video calls liquid.
+For each the second difference in time (splashbench/video/flicker.py) at timesteps (`seams`), at the frames `between`,
+their ratio, and the mean over all frames, in levels of 255. All are taken over the pixels that the rendered video calls
+liquid.
 
 jump       mean difference in levels between a timestep's render and those a thousandth of a step before and after: 0
            where the interpolation meets the timesteps
@@ -36,7 +37,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import write_json, write_text
 from splashbench.harness import hardware
 from splashbench.progress import track
-from splashbench.video.flicker import Jitter, jitter, subdivided
+from splashbench.video.flicker import SecondDifference, second_difference, subdivided
 
 _VISIBLE = 0.5
 # Of a step: how near to a timestep a jump is looked for.
@@ -61,9 +62,9 @@ def measure(reconstruction: Reconstruction, view: str, parts: int) -> dict[str, 
     before = np.minimum(places.astype(int), len(steps) - 2)
     share = (places - before).astype(np.float32)[:, None, None, None]
     videos = {
-        "rendered": jitter(rgb, liquid, parts),
-        "held": jitter(steps[places.astype(int)], liquid, parts),
-        "faded": jitter((1 - share) * steps[before] + share * steps[before + 1], liquid, parts),
+        "rendered": second_difference(rgb, liquid, parts),
+        "held": second_difference(steps[places.astype(int)], liquid, parts),
+        "faded": second_difference((1 - share) * steps[before] + share * steps[before + 1], liquid, parts),
     }
     return {
         "submission": str(reconstruction.submission.directory.name),
@@ -108,7 +109,7 @@ def _difference(one: Frames, other: Frames, liquid: NDArray[np.bool_]) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def _figures(values: Jitter) -> dict[str, float]:
+def _figures(values: SecondDifference) -> dict[str, float]:
     return {"seams": values.seams, "between": values.between, "ratio": values.ratio, "mean": values.mean}
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import os
 import zipfile
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import pytest
 from splashbench import toml
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files import (
+    NO_ROOM,
     atomic_directory,
     atomic_path,
+    files_together,
     read_gray,
     read_image,
     read_json,
@@ -60,6 +63,49 @@ def test_a_full_disk_is_one_line_naming_the_file(tmp_path: Path) -> None:
     with pytest.raises(DiskFullError, match=r"big.json could not be written: the disk is full"), atomic_path(path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", NO_ROOM)
+def test_a_library_that_tells_of_no_room_in_words_is_understood(number: int, tmp_path: Path) -> None:
+    said = RuntimeError(f"Failed to write: {os.strerror(number)}")  # as OpenUSD and OpenEXR raise
+    for writing in (
+        atomic_path(tmp_path / "out"),
+        atomic_directory(tmp_path / "out"),
+        files_together(tmp_path / "out"),
+    ):
+        with pytest.raises(DiskFullError, match="out could not be written: the disk is full"), writing:
+            raise said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_what_another_process_has_just_written_stays(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_links(*_: object) -> None:
+        raise PermissionError
+
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    path = tmp_path / "a.json"
+    with atomic_path(path, replace=False) as temporary:
+        temporary.write_text("mine")
+    assert path.read_text() == "mine"
+    assert path.stat().st_nlink == 1
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(SplashbenchError, match="exists already"), atomic_path(tmp_path / "b", False) as temporary:
+        temporary.write_text("mine")
+        (tmp_path / "b").write_text("theirs")
+    assert (tmp_path / "b").read_text() == "theirs"
+
+
+def test_a_name_that_is_taken_after_the_last_look_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.json"
+    with pytest.raises(SplashbenchError, match=r"a\.json exists already"), atomic_path(path, False) as temporary:
+        temporary.write_text("mine")
+        monkeypatch.setattr("splashbench.files.atomic.require_file_place", lambda *_: path.write_text("theirs"))
+    assert path.read_text() == "theirs"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

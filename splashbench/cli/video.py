@@ -89,7 +89,7 @@ def _add_times(parser: argparse.ArgumentParser) -> None:
         "--fps",
         type=positive_number("frames a second", _MAX_FPS),
         metavar="N",
-        help="frames a second (default: 30, or the path's; 33.3 for .gif)",
+        help="frames a second (default: 30, or the path's; for .gif the nearest that it can have)",
     )
     speed = times.add_mutually_exclusive_group()
     speed.add_argument(
@@ -147,7 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench video`."""
     from splashbench.replay import load
     from splashbench.video import VideoSettings, make_film, write_video
-    from splashbench.video.output import default_fps, require_place
+    from splashbench.video.output import rate_for, require_place
 
     _require_sense(arguments)
     folders = [arguments.submission, *map(Path, _others(arguments))]
@@ -158,7 +158,7 @@ def run(arguments: argparse.Namespace) -> int:
         from splashbench.restyle import restyled
 
         reconstruction = restyled(reconstruction, dye_named(arguments.dye), arguments.density, arguments.light)
-    compared = _comparison(arguments)
+    compared = _comparison(arguments, reconstruction)
     for source in (reconstruction, *compared.reconstructions):
         if not source.has_model and not arguments.timesteps:
             say(f"{source.submission.directory} has no model to render: a frame for each timestep")
@@ -180,7 +180,7 @@ def run(arguments: argparse.Namespace) -> int:
         caption=not arguments.no_caption,
         **({} if arguments.flat is None else {"flat": arguments.flat}),
     )
-    film = make_film(reconstruction, settings, compared, default_fps(arguments.out))
+    film = make_film(reconstruction, settings, compared, rate_for(arguments.out))
     write_video(film, arguments.out, arguments.replace)
     about = film.about()
     say("wrote {}: {frames} frames of {width}x{height}, {seconds:.2f} s".format(arguments.out, **about))
@@ -195,15 +195,15 @@ def _others(arguments: argparse.Namespace) -> list[str]:
     return [name for name in named if name != _TRUTH]
 
 
-def _comparison(arguments: argparse.Namespace) -> Comparison:
-    """What SUBMISSION is compared with, opened."""
+def _comparison(arguments: argparse.Namespace, shown: Reconstruction) -> Comparison:
+    """What SUBMISSION, `shown`, is compared with, opened."""
     from splashbench.replay import load
     from splashbench.video import TRUTH, Comparison
 
     def opened(folder: Path) -> Reconstruction:
         # --method is of SUBMISSION, and may be of both.
-        same = arguments.method and _method(folder) == _method(arguments.submission)
-        return load(folder, arguments.scene, method=arguments.method if same else None)
+        same = arguments.method and _method(folder) == shown.name
+        return load(folder, shown.scene, method=arguments.method if same else None)
 
     named = arguments.beside or ([arguments.wipe] if arguments.wipe is not None else [])
     others: list[Reconstruction | str] = [TRUTH if name == _TRUTH else opened(Path(name)) for name in named]

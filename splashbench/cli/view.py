@@ -84,6 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.usage_error(f"two can be seen side by side, not {len(arguments.places)}")
     if arguments.camera and not arguments.screenshot:
         arguments.usage_error("--camera is for --screenshot; in the browser choose one in the panel")
+    if arguments.screenshot and len(arguments.places) == 2 and arguments.size[0] % 2:
+        arguments.usage_error(f"--size: a width of {arguments.size[0]} does not halve; give an even one for two halves")
     from splashbench.submission import IDENTITY, require_outside
 
     sealed = [place for place in arguments.places if (place / IDENTITY).is_file()]
@@ -103,7 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.viewer.panel import Panel
     from splashbench.viewer.viewer import Viewer
 
-    exhibits = [open_exhibit(place, arguments.scene, _method_of(place, arguments.method)) for place in arguments.places]
+    methods = _methods_of(arguments.places, arguments.method)
+    exhibits = [open_exhibit(place, arguments.scene, method) for place, method in zip(arguments.places, methods)]
     if arguments.camera:
         exhibits[0].camera(arguments.camera)
     if arguments.scene and all(isinstance(exhibit, SceneExhibit) for exhibit in exhibits):
@@ -134,17 +137,26 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _method_of(place: Path, method: str | None) -> str | None:
-    """`method`, FILE.py:CLASS, where the submission in `place` is of it: of two, one may be of an installed method."""
+def _methods_of(places: list[Path], method: str | None) -> list[str | None]:
+    """`method`, FILE.py:CLASS, for each submission that is of it: of two, one may be of an installed method."""
     if method is None:
-        return None
+        return [None] * len(places)
     from splashbench.harness.discovery import load_method
-    from splashbench.submission import Submission
 
     own = load_method(method).id
+    found = [method if _identity_of(place) == own else None for place in places]
+    if not any(found) and all(place.is_dir() for place in places):
+        raise SplashbenchError(f"--method {method} is {own!r}, and nothing that is to be seen is of it; leave it out")
+    return found
+
+
+def _identity_of(place: Path) -> str | None:
+    """Id of the method of the submission in `place`; None for a scene, or nothing, which is found at opening."""
+    from splashbench.submission import Submission
+
     try:
-        return method if Submission.open(place, verify=False).identity.method == own else None
-    except SplashbenchError:  # a scene, or nothing at all, which is found when it is opened
+        return Submission.open(place, verify=False).identity.method
+    except SplashbenchError:
         return None
 
 

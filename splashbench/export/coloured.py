@@ -6,11 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.export.harmonics import Viewpoints, fit_harmonics
 from splashbench.export.placement import Placement
+from splashbench.gaussians.spherical_harmonics import constant_of
 from splashbench.replay import Reconstruction
 from splashbench.scene import Gaussians
 
@@ -43,8 +45,7 @@ class Coloured:
     def plain(cls, gaussians: Gaussians, degree: int, fixed: bool = False) -> Coloured:
         """`gaussians`, placed already, with their colours the same from everywhere."""
         coefficients = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
-        anywhere = Viewpoints(np.zeros((1, 3)), np.ones(1))
-        coefficients[:, :1] = fit_harmonics(gaussians.means, gaussians.colors[None], anywhere, 0)
+        coefficients[:, 0] = constant_of(torch.as_tensor(gaussians.colors, dtype=torch.float64)).numpy()
         return cls(gaussians, coefficients, fixed)
 
 

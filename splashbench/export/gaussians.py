@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.export.backdrop import backdrop_color, hex_color
+from splashbench.export.backdrop import backdrop_color
 from splashbench.export.coloured import Coloured, coloured, require_finite
 from splashbench.export.gaussian_files import write_gaussians
 from splashbench.export.harmonics import MAX_DEGREE, Viewpoints, viewpoints
@@ -24,6 +24,7 @@ from splashbench.export.sphere import enclosing_sphere
 from splashbench.progress import track
 from splashbench.replay import Reconstruction
 from splashbench.scene import Gaussians
+from splashbench.srgb import hex_color
 
 Part = Literal["all", "liquid", "background"]
 PARTS: tuple[Part, ...] = get_args(Part)

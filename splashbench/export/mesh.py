@@ -96,7 +96,7 @@ def mesh_at(reconstruction: Reconstruction, time: float, placement: Placement) -
     if distance is None:
         raise nothing_of(reconstruction, "signed distance", "export its particles (--format particles)")
     mesh = surface_mesh(distance)
-    field = reconstruction.velocity(time) if len(mesh.vertices) else None
+    field = reconstruction.velocity(time)
     velocities = None if field is None else field.at(mesh.vertices)
     if velocities is not None and not np.isfinite(velocities).all():
         directory, name = reconstruction.submission.directory, reconstruction.name

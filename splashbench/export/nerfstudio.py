@@ -113,7 +113,7 @@ def _liquid_points(reconstruction: Reconstruction, t: int, most: int) -> NDArray
     if gaussians is not None:
         return _means(gaussians, most)
     particles = reconstruction.particles()
-    if particles is None or particles.n_frames != len(reconstruction.times):
+    if particles is None:
         return np.zeros((0, 6))
     positions = thinned(particles.at(t).astype(np.float64), most)
     return np.concatenate([positions, np.full((len(positions), 3), _GREY)], axis=1)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.errors import SplashbenchError
 from splashbench.export.instants import all_or, timesteps
 from splashbench.export.manifest import Manifest, export_folder, frame_files, nothing_of, write_manifest
 from splashbench.export.placement import Placement
@@ -42,11 +41,6 @@ def export_particles(
     particles = reconstruction.particles()
     if particles is None:
         raise nothing_of(reconstruction, "particles", "export its mesh or its Gaussians (--format mesh or ply)")
-    if particles.n_frames != len(reconstruction.times):
-        raise SplashbenchError(
-            f"{reconstruction.submission.directory}: particles.npz has {particles.n_frames} instants, its scene "
-            f"{len(reconstruction.times)}; run the method again"
-        )
     steps = timesteps(reconstruction, instants, "particles")
     files = frame_files(len(instants), "ply")
     kept: list[dict[str, NDArray]] = []

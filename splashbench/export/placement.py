@@ -17,6 +17,9 @@ from splashbench.scene import Camera, Gaussians
 Up = Literal["y", "z", "y-down"]
 UPS: dict[Up, tuple[float, float, float]] = {"y": (0, 1, 0), "z": (0, 0, 1), "y-down": (0, -1, 0)}
 
+#: Places farther out, in the export's units, are refused: float32 would soon hold no squares of them.
+FARTHEST = 1e30
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -33,8 +36,16 @@ class Placement:
     up: Up | None = None
 
     def points(self, points: NDArray) -> NDArray[np.float64]:
-        """Places [..., 3] of the scene in the export; velocities [..., 3] likewise."""
-        return self.scale * self.directions(points)
+        """Places [..., 3] of the scene in the export; velocities [..., 3] likewise.
+
+        Raises SplashbenchError for what no program could draw: NaN, or beyond `FARTHEST`.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            placed = self.scale * self.directions(points)
+        if not (np.abs(placed) <= FARTHEST).all():
+            remedy = "leave --metres out, or fit again" if self.units == "metres" else "fit again"
+            raise SplashbenchError(f"places or velocities are beyond {FARTHEST:g} {self.units}, or NaN; {remedy}")
+        return placed
 
     def directions(self, directions: NDArray) -> NDArray[np.float64]:
         """Directions [..., 3] of the scene in the export."""

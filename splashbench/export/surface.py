@@ -43,11 +43,6 @@ class SurfaceMesh:
     faces: NDArray[np.int32]
     normals: NDArray[np.float64]
 
-    @property
-    def volume(self) -> float:
-        """What it encloses, cubic scene units."""
-        return _enclosed(self.vertices, self.faces) if len(self.vertices) else 0.0
-
 
 def surface_mesh(distance: SignedDistance) -> SurfaceMesh:
     """The mesh around all liquid of a signed distance at one instant; empty where there is no liquid.
@@ -69,14 +64,6 @@ def surface_mesh(distance: SignedDistance) -> SurfaceMesh:
     vertices = _with_volume(vertices.astype(np.float64), faces, depths, volume_below(field))
     normals = _normals(vertices, faces)
     return SurfaceMesh(distance.origin + (vertices + corner) * distance.voxel, faces, normals)
-
-
-def liquid_volume(distance: SignedDistance, samples: int = _SAMPLES) -> float:
-    """The volume in which a signed distance at one instant is negative, cubic scene units; see `volume_below`."""
-    steps = distance.phi[0]
-    if not (steps < 0).any():
-        return 0.0
-    return volume_below(_framed(steps)[0], samples) * distance.voxel**3
 
 
 def _framed(steps: NDArray[np.int8]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.export.mesh_files import PlacedMesh
 from splashbench.export.placement import Placement
+from splashbench.files import as_asked
 
 #: Of a single instant, which has no step.
 _FPS = 24.0
@@ -40,7 +41,7 @@ class MeshStage:
             raise SplashbenchError(
                 f"{path.name} needs the package usd-core; install splashbench[usd], or take --mesh-format ply"
             ) from None
-        self._vt = Vt
+        self._vt, self._path = Vt, path
         fps = 1 / float(np.diff(times).min()) if len(times) > 1 else _FPS
         codes = 1 + (times - times[0]) * fps
         self._codes = np.where(np.abs(codes - codes.round()) < _SAME, codes.round(), codes)
@@ -63,19 +64,21 @@ class MeshStage:
         code = float(self._codes[frame])
         vertices = mesh.vertices.astype(np.float32)
         extent = np.stack([vertices.min(axis=0), vertices.max(axis=0)]) if len(vertices) else np.zeros((2, 3))
-        velocities = np.zeros_like(vertices) if mesh.velocities is None else mesh.velocities
         usd = self._mesh
         usd.CreatePointsAttr().Set(self._vectors(vertices), code)
         usd.CreateNormalsAttr().Set(self._vectors(mesh.normals), code)
         usd.CreateFaceVertexCountsAttr().Set(self._integers(np.full(len(mesh.faces), 3)), code)
         usd.CreateFaceVertexIndicesAttr().Set(self._integers(mesh.faces.ravel()), code)
         usd.CreateExtentAttr().Set(self._vectors(extent), code)
-        if mesh.velocities is not None or not len(vertices):
-            usd.CreateVelocitiesAttr().Set(self._vectors(velocities), code)
+        if mesh.velocities is not None:
+            usd.CreateVelocitiesAttr().Set(self._vectors(mesh.velocities), code)
 
     def save(self) -> None:
-        """Write the file."""
-        self._stage.GetRootLayer().Save()
+        """Write the file. Raises SplashbenchError where OpenUSD does not say why it could not."""
+        if not self._stage.GetRootLayer().Save():
+            raise SplashbenchError(
+                f"{as_asked(self._path)} could not be written by OpenUSD; look at its place and disk"
+            )
 
     def _vectors(self, table: NDArray) -> Any:
         return self._vt.Vec3fArray.FromNumpy(np.ascontiguousarray(table, dtype=np.float32))

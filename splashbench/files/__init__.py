@@ -6,6 +6,7 @@ limits on its size, without pickles, and fails with one line that names the file
 
 from splashbench.files.arrays import MAX_NPZ_BYTES, compressed_bytes, read_npz, write_npz
 from splashbench.files.atomic import (
+    NO_ROOM,
     as_asked,
     atomic_directory,
     atomic_path,
@@ -40,6 +41,7 @@ __all__ = [
     "MAX_JSON_BYTES",
     "MAX_NPZ_BYTES",
     "MAX_PIXELS",
+    "NO_ROOM",
     "as_asked",
     "atomic_directory",
     "atomic_path",

@@ -15,6 +15,8 @@ from pathlib import Path
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files.places import require_file_place, require_folder_place
 
+#: What the system says where a file has no room: the disk, the user's quota or the limit of a file's size is reached.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Of the file that marks an output: a video's has a time for each frame.
 _MAX_MARKER_BYTES = 16_000_000
 _STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-")
@@ -50,8 +52,7 @@ def atomic_path(path: Path, replace: bool = True) -> Iterator[Path]:
     done = False
     try:
         yield temporary
-        require_file_place(path, replace)
-        temporary.replace(path)
+        _put(temporary, path, replace)
         done = True
     except (OSError, RuntimeError) as error:
         raise_if_disk_full(path, error)
@@ -63,20 +64,38 @@ def atomic_path(path: Path, replace: bool = True) -> Iterator[Path]:
                 path.parent.rmdir()
 
 
+def _put(temporary: Path, path: Path, replace: bool) -> None:
+    """Give `temporary` the name `path`. Raises SplashbenchError where that is taken and not to `replace`."""
+    require_file_place(path, replace)
+    if not replace:
+        try:
+            os.link(temporary, path)  # unlike a rename it takes no name that another process has just taken
+        except FileExistsError:
+            raise _taken(path) from None
+        except OSError:
+            pass  # a file system without links: what was checked has to do
+        else:
+            return  # the temporary name goes by itself
+    temporary.replace(path)
+
+
+def _taken(path: Path) -> SplashbenchError:
+    return SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+
+
 def raise_if_disk_full(path: Path | str, error: Exception) -> None:
     """Raise DiskFullError where `error` says that the disk is full; libraries report it in several ways."""
     if isinstance(error, DiskFullError):
         raise error
     number, text = getattr(error, "errno", None), str(error)
-    no_room = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     # Pillow's encoders and numpy's tofile drop the system's error number; only their messages tell of a failed write.
-    # OpenEXR raises a RuntimeError with the system's words.
+    # OpenEXR and OpenUSD raise a RuntimeError with the system's words.
     library_failed = number is None and (
         "when writing image file" in text
         or ("requested and" in text and "written" in text)
-        or os.strerror(errno.ENOSPC) in text
+        or any(os.strerror(each) in text for each in NO_ROOM)
     )
-    if no_room or library_failed:
+    if number in NO_ROOM or library_failed:
         raise DiskFullError(
             f"{as_asked(path)} could not be written: the disk is full; free some space and run the command again"
         ) from None
@@ -115,7 +134,7 @@ def atomic_directory(
         if path.exists():
             path.rename(retired)
         temporary.rename(path)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise_if_disk_full(path, error)
         raise
     finally:
@@ -136,7 +155,7 @@ def _require_replaceable(
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not replace:
-        raise SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+        raise _taken(path)
     if not path.is_dir():
         raise SplashbenchError(f"{path} is a file; give the name of a folder")
     if holds is not None and not (path / holds).is_file():
@@ -179,7 +198,7 @@ def files_together(directory: Path) -> Iterator[Path]:
                 raise SplashbenchError(f"{directory / path.name} is a folder; move it away, or write elsewhere")
         for path in made:
             path.replace(directory / path.name)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise_if_disk_full(directory, error)
         raise
     finally:

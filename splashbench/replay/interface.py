@@ -20,7 +20,7 @@ from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 # Of a voxel: the step along a ray where the liquid is near.
 _STEP = 0.5
-# Of a voxel: how far phi is sampled to either side for the normal. The distance is stored in eighths.
+# Of a voxel: how far phi is sampled to either side for the normal. The distance is stored in sixteenths.
 _NORMAL_REACH = 1.5
 # A surface is found to within this part of a step by halving it.
 _HALVINGS = 6

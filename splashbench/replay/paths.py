@@ -28,6 +28,8 @@ MAX_FRAMES, MAX_SIDE, MAX_FPS = 100_000, 8192, 1000.0
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 # Largest gap between the azimuths of neighbouring cameras, in degrees, around which there are cameras everywhere.
 _ALL_AROUND = 90.0
+# An arc of so few radians is rounding.
+_STILL = 1e-6
 # How near to the poles an orbit may be: there the picture has no up.
 _STEEPEST = 89.0
 
@@ -208,7 +210,7 @@ def orbit(
         height: degrees above the horizon of `target`; by default the cameras' median.
 
     An arc is swept forth and back, slowing down at its ends, so that the video may be played in a loop; a circle is
-    gone round once. Raises SplashbenchError where there is no camera beside `target`.
+    gone round once. Raises SplashbenchError where there is no camera beside `target`, and for an arc of 0.
     """
     center, vertical = np.asarray(target, dtype=np.float64), np.asarray(up, dtype=np.float64)
     vertical = vertical / np.linalg.norm(vertical)
@@ -224,6 +226,11 @@ def orbit(
     elevations = np.degrees(np.arcsin(np.clip(offsets @ vertical / np.maximum(distances, 1e-12), -1, 1)))
     elevation = math.radians(float(np.clip(np.median(elevations) if height is None else height, -_STEEPEST, _STEEPEST)))
     sweep = arc if degrees is None else math.radians(degrees)
+    if not sweep > _STILL:
+        raise SplashbenchError(
+            "the training cameras look from one direction, so that there is no arc to move along; give the orbit's own "
+            "(--orbit-degrees)"
+        )
     phase = np.arange(frames) / frames
     circle = sweep >= 2 * math.pi - 1e-9
     angles = middle + (sweep * (phase - 0.5) if circle else -sweep / 2 * np.cos(2 * np.pi * phase))

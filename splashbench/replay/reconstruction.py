@@ -107,8 +107,19 @@ class Reconstruction:
         return self.submission.particles()
 
     def particles(self) -> Particles | None:
-        """The method's particles on the timesteps, or None."""
-        return self._particles
+        """The method's particles on the timesteps, or None. Raises SplashbenchError for those of other timesteps."""
+        particles = self._particles
+        if particles is not None:
+            self._require_timesteps("particles.npz", particles.n_frames)
+        return particles
+
+    def _require_timesteps(self, file: str, count: int) -> None:
+        """Raise SplashbenchError unless the submission's `file` has as many instants as there are timesteps."""
+        if count != len(self.times):
+            raise SplashbenchError(
+                f"{self.submission.directory / file} has {count} instants, and its scene {len(self.times)} timesteps; "
+                "run the method again"
+            )
 
     @cached_property
     def _distances(self) -> SignedDistance | None:
@@ -126,11 +137,7 @@ class Reconstruction:
         distances = self._distances
         if distances is None:
             return None
-        if distances.n_frames != len(self.times):
-            raise SplashbenchError(
-                f"{self.submission.directory / 'geometry.npz'} has {distances.n_frames} instants, and its scene "
-                f"{len(self.times)} timesteps; run the method again"
-            )
+        self._require_timesteps("geometry.npz", distances.n_frames)
         if len(self.times) == 1:
             t, share = 0, 0.0
         else:
@@ -151,14 +158,14 @@ class Reconstruction:
 
 
 def load(
-    submission: Path | str, scene: Path | str | None = None, verify: bool = True, method: str | None = None
+    submission: Path | str, scene: Scene | Path | str | None = None, verify: bool = True, method: str | None = None
 ) -> Reconstruction:
     """Open what `splashbench run` wrote, to be rendered from anywhere at any time.
 
     Args:
         submission: its folder.
-        scene: the scene's folder. Methods whose opacity of the liquid comes from masks need it, and so do photographs
-            to compare with; for splashsplat it may be left out.
+        scene: the scene, or its folder. Methods whose opacity of the liquid comes from masks need it, and so do
+            photographs to compare with; for splashsplat it may be left out.
         verify: whether files must have the digests that SHA256SUMS states.
         method: `FILE.py:CLASS` of a method that is not installed, which runs its code.
 
@@ -173,11 +180,11 @@ def load(
         raise SplashbenchError(
             f"{submission} is of a run that ended with status {opened.status.value}; nothing to show"
         )
-    whole = None if scene is None else Scene.open(Path(scene))
+    whole = scene if scene is None or isinstance(scene, Scene) else Scene.open(Path(scene))
     if whole is not None and whole.digest != identity.scene_digest:
         raise SplashbenchError(
-            f"{submission} was made for another version of scene {identity.scene} than {scene}; give the scene it was "
-            "run on"
+            f"{submission} was made for another version of scene {identity.scene} than {whole.directory}; give the "
+            "scene it was run on"
         )
     known = _known_scene(opened, whole)
     model = opened.directory / "model"

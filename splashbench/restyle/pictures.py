@@ -13,7 +13,7 @@ from splashbench.progress import track
 from splashbench.replay import Reconstruction
 from splashbench.restyle.filmed_dye import FilmedDye
 from splashbench.restyle.relighting import Buffers, Restyled, metres_per_unit
-from splashbench.srgb import to_srgb
+from splashbench.srgb import hex_color, to_srgb
 from splashbench.submission import to_8bit
 from splashbench.submission.exr import write_channels
 
@@ -89,12 +89,7 @@ def filmed_facts(reconstruction: Reconstruction, filmed: FilmedDye) -> dict[str,
         "absorption_low": None if filmed.opaque else low,
         "absorption_high": None if filmed.opaque else high,
         "absorption_at_least": low if filmed.opaque else None,
-        "thick_layers": hex_color(filmed.returned),
+        "thick_layers": hex_color(to_srgb(filmed.returned)),
         "refractive_index": filmed.index,
         "metric": reconstruction.metres_per_unit is not None,
     }
-
-
-def hex_color(linear: np.ndarray) -> str:
-    """`#rrggbb` (sRGB) of linear light [3]."""
-    return "#" + "".join(f"{value:02x}" for value in to_8bit(to_srgb(linear)).tolist())

@@ -111,7 +111,7 @@ class SceneMeta(BaseModel):
     times: list[float] | None = None
     camera_times: dict[str, list[float]] | None = None
     sizes: dict[str, tuple[int, int]] | None = None
-    metres_per_unit: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    metres_per_unit: float | None = Field(default=None, ge=1e-9, le=1e9, allow_inf_nan=False)
     gravity: tuple[float, float, float] | None = None
     container_mesh: str | None = None
     container_pose: list[list[float]] | None = None

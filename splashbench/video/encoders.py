@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import write_png
+from splashbench.files import NO_ROOM, write_png
 
 _QUALITY, _PRESET = 17, "veryfast"  # x264's constant rate factor
 # A GIF's frames last whole hundredths of a second, and browsers slow down those that last one.
@@ -56,7 +55,7 @@ def _libav_errors() -> Iterator[None]:
     try:
         yield
     except av.FFmpegError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if error.errno in NO_ROOM:
             raise OSError(error.errno, str(error.strerror)) from None
         raise
 

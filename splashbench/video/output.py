@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +20,6 @@ from splashbench.progress import track
 from splashbench.submission import require_outside
 from splashbench.video.encoders import Encoder, PngFolder, encode_gif, encode_mp4, gif_rate
 from splashbench.video.film import Film
-from splashbench.video.timing import DEFAULT_FPS
 
 #: What tells a folder of frames, with their times and what they show.
 FRAMES = "frames.json"
@@ -54,9 +53,9 @@ def require_place(out: Path, replace: bool, submissions: Sequence[Path]) -> None
     require_file_place(out, replace)
 
 
-def default_fps(out: Path) -> float:
-    """Frames a second where the user says none: as near to `DEFAULT_FPS` as a file like `out` can have."""
-    return gif_rate(DEFAULT_FPS) if out.suffix.lower() == ".gif" else DEFAULT_FPS
+def rate_for(out: Path) -> Callable[[float], float]:
+    """What makes of frames a second the nearest ones that a file like `out` can have."""
+    return gif_rate if Path(out).suffix.lower() == ".gif" else lambda fps: fps
 
 
 def write_video(film: Film, out: Path, replace: bool = False) -> None:

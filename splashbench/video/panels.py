@@ -40,6 +40,8 @@ class Photographs:
 
     def __init__(self, scene: Scene, view: str) -> None:
         self._scene, self._view = scene, view
+        # The last picture, and of which timestep and size it is: slow motion shows each for many frames.
+        self._last: tuple[tuple[int, int, int], NDArray[np.uint8]] | None = None
 
     def _nearest(self, time: float) -> int:
         return int(np.abs(self._scene.camera_times[self._view] - time).argmin())
@@ -56,7 +58,15 @@ class Photographs:
 
     def picture(self, camera: Camera, time: float) -> NDArray[np.uint8]:
         """As `Panel.picture` says, at the size of `camera`."""
-        pixels = self._scene.image(self._view, self._nearest(time))
+        key = (self._nearest(time), camera.width, camera.height)
+        if self._last is None or self._last[0] != key:
+            picture = self._read(key[0], camera)
+            picture.flags.writeable = False
+            self._last = (key, picture)
+        return self._last[1]
+
+    def _read(self, t: int, camera: Camera) -> NDArray[np.uint8]:
+        pixels = self._scene.image(self._view, t)
         if pixels.shape[:2] == (camera.height, camera.width):
             return pixels
         import cv2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 
 import numpy as np
@@ -30,9 +30,12 @@ def make_film(
     reconstruction: Reconstruction,
     settings: VideoSettings,
     compared: Comparison | None = None,
-    default_fps: float = DEFAULT_FPS,
+    rate: Callable[[float], float] = lambda fps: fps,
 ) -> Film:
-    """The film that `settings` ask for, with what it is `compared` with. default_fps: where they say none.
+    """The film that `settings` ask for, with what it is `compared` with.
+
+    rate: makes frames a second that nobody has said (30, a path's own, the timesteps' own) into those that the video's
+    file can have, see `splashbench.video.output.rate_for`.
 
     Example: `write_video(make_film(splashbench.load("submissions/bowl"), VideoSettings(slow=8)), Path("bowl.mp4"))`.
 
@@ -44,7 +47,7 @@ def make_film(
     if compared.layout == "wipe" and len(compared.others) != 1:
         raise SplashbenchError("a wipe shows two; give it truth or one other submission")
     view = _view(reconstruction, settings)
-    when, cameras = _frames(sources, settings, view, default_fps)
+    when, cameras = _frames(sources, settings, view, rate)
     largest = max(cameras[0].width, cameras[0].height)
     if largest > MAX_SIDE:
         raise SplashbenchError(f"pictures of {largest} pixels a side are more than {MAX_SIDE}; give a smaller --resize")
@@ -99,7 +102,7 @@ def _view(reconstruction: Reconstruction, settings: VideoSettings) -> str | None
 
 
 def _frames(
-    sources: Sequence[Reconstruction], settings: VideoSettings, view: str | None, default_fps: float
+    sources: Sequence[Reconstruction], settings: VideoSettings, view: str | None, rate: Callable[[float], float]
 ) -> tuple[Timing, list[Camera]]:
     """When the frames are, and their cameras: one for each, or one for all."""
     reconstruction = sources[0]
@@ -108,8 +111,8 @@ def _frames(
     if settings.fps is not None:
         timing.require_rate(settings.fps)
     if settings.path is not None:
-        return _path_frames(settings, times)
-    when = _timing(sources, settings, times, default_fps)
+        return _path_frames(settings, times, rate)
+    when = _timing(sources, settings, times, rate)
     if view is not None:
         return when, [resized(reconstruction.cameras[view], settings.resize)]
     path = orbit_of(reconstruction, len(when), settings.orbit_degrees, settings.orbit_height, when.fps)
@@ -117,18 +120,22 @@ def _frames(
 
 
 def _timing(
-    sources: Sequence[Reconstruction], settings: VideoSettings, times: NDArray[np.float64], default_fps: float
+    sources: Sequence[Reconstruction],
+    settings: VideoSettings,
+    times: NDArray[np.float64],
+    rate: Callable[[float], float],
 ) -> Timing:
     """The instants of a view's or an orbit's frames, the recording's timesteps being at `times`."""
     start, end = timing.chosen_span(times, settings.start, settings.end)
     if settings.slow is not None and settings.seconds is not None:
         raise SplashbenchError("--slow and --seconds both say how long the video is; give one of them")
-    fps = settings.fps or default_fps
+    fps = settings.fps or rate(DEFAULT_FPS)
     # Where there is no model, there are the timesteps alone.
     if settings.timesteps or not all(source.has_model for source in sources):
         if settings.seconds is not None:
             raise SplashbenchError("a video of the timesteps alone is as long as they are; leave --seconds out")
-        return timing.stepwise(times, start, end, settings.fps, settings.slow or 1.0)
+        steps = timing.stepwise(times, start, end, settings.fps, settings.slow or 1.0)
+        return steps if settings.fps is not None else Timing(steps.times, rate(steps.fps))
     if start == end and not (settings.orbit and settings.seconds is not None):
         raise SplashbenchError(
             f"a video of {start:g} s alone is an orbit that lasts a while; give --orbit and --seconds, or a later --end"
@@ -138,7 +145,9 @@ def _timing(
     return timing.slowed(start, end, fps, settings.slow or 1.0)
 
 
-def _path_frames(settings: VideoSettings, times: NDArray[np.float64]) -> tuple[Timing, list[Camera]]:
+def _path_frames(
+    settings: VideoSettings, times: NDArray[np.float64], rate: Callable[[float], float]
+) -> tuple[Timing, list[Camera]]:
     """A path's cameras, at its own times or spread evenly over the chosen part of the recording."""
     assert settings.path is not None
     path = read_camera_path(settings.path, (float(times[0]), float(times[-1])))
@@ -149,7 +158,7 @@ def _path_frames(settings: VideoSettings, times: NDArray[np.float64]) -> tuple[T
     if refused:
         known = "frames" if path.times is None else "frames and their times"
         raise SplashbenchError(f"{settings.path} says what {known} there are; leave {', '.join(refused)} out")
-    fps = settings.fps or path.fps
+    fps = settings.fps or rate(path.fps)
     if path.times is None:
         when = timing.spread(*timing.chosen_span(times, settings.start, settings.end), len(path), fps)
     else:

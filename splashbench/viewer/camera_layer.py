@@ -143,7 +143,8 @@ class CameraLayer(Layer):
     @property
     def loading(self) -> tuple[int, int] | None:
         """Timesteps whose photographs are there, and T."""
-        there = sum(len(small) == len(self._cameras) for small in self._small.values())
+        with self._lock:
+            there = sum(len(small) == len(self._cameras) for small in self._small.values())
         wanted = min(self._n_frames, self._most)
         return (there, wanted) if self.on and there < wanted else None
 

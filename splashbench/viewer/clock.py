@@ -102,6 +102,12 @@ class PlayClock:
             self._hold()
             return self._index()
 
+    def read(self) -> tuple[int, float, bool]:
+        """The timestep that is to be shown now, its time in seconds, and whether the clock runs: all of one moment."""
+        with self._lock:
+            t = self.tick()
+            return t, float(self._times[t]), self._playing
+
     @property
     def seconds(self) -> float:
         """The time of the timestep that is shown, seconds of the recording."""

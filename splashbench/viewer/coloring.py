@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 UNKNOWN, PLAIN = (150, 150, 150), (70, 130, 230)
 
 
+@lru_cache
 def _scale() -> NDArray[np.uint8]:
     from matplotlib import colormaps
 

@@ -1,6 +1,7 @@
 """What is looked at: a scene or a submission, as the viewer's layers ask for it.
 
-Everything is asked for by timestep and made when asked for: the viewer does so on one thread, apart from its clock.
+At opening a submission's model is asked what it has, and where its liquid is. The rest is asked for by timestep and
+made when asked for: the viewer does so on one thread, apart from its clock.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.errors import SplashbenchError
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.export.backdrop import backdrop_color
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames
 from splashbench.replay import Reconstruction, load
 from splashbench.scene import Camera, ContainerMesh, Gaussians, Particles, Scene, SignedDistance, VelocityField
-from splashbench.submission.submission import IDENTITY
+from splashbench.submission import IDENTITY, to_8bit
 from splashbench.viewer.tracks import Tracks
 
 #: Cells of a scene's visual hull along its longest side: coarse, so that a timestep takes a fraction of a second.
@@ -58,7 +59,7 @@ class Exhibit(ABC):
         cameras: name -> Camera, training cameras first. train: names of those.
         gravity: unit vector [3] or None. metres_per_unit: number or None.
         has_gaussians, has_background, has_points, has_particles, has_distance, has_velocity, has_container,
-            has_picture: what there is of it, known before any of it is made.
+            has_picture: what there is of it, known from the opening.
         particles_title, surface_title: what its particles and its surface are, for people.
     """
 
@@ -300,7 +301,7 @@ class SubmissionExhibit(Exhibit):
     def ground(self) -> NDArray[np.uint8] | None:
         """The colour that the method shows through the gaps of its background."""
         color = backdrop_color(self.reconstruction)
-        return None if color is None else np.asarray(np.rint(color * 255), dtype=np.uint8)
+        return None if color is None else to_8bit(color)
 
     def distance(self, t: int) -> SignedDistance | None:
         """The method's."""
@@ -315,7 +316,7 @@ class SubmissionExhibit(Exhibit):
         if not self.reconstruction.has_model:
             return None
         rgb = self.reconstruction.render(camera, float(self.times[t])).rgb
-        return np.rint(np.clip(np.nan_to_num(rgb), 0, 1) * 255).astype(np.uint8)
+        return to_8bit(np.nan_to_num(rgb))
 
     @property
     def coarse(self) -> str:
@@ -339,16 +340,29 @@ def open_exhibit(place: Path, scene: Path | None = None, method: str | None = No
 
     scene: that a submission was made for. method: `FILE.py:CLASS` of a submission's method that is not installed.
 
-    Raises SplashbenchError for a folder that is neither, and for what `Scene.open` and `splashbench.load` refuse.
+    Raises SplashbenchError for a folder that is neither, for what `Scene.open` and `splashbench.load` refuse, and for a
+    model that fails.
     """
     if not place.is_dir():
         raise SplashbenchError(f"{place} is not a folder; give the folder of a scene or of a submission")
     if (place / IDENTITY).is_file():
-        return SubmissionExhibit(load(place, scene, method=method))
+        return _open_submission(place, scene, method)
     try:
         return SceneExhibit(Scene.open(place))
     except SplashbenchError as error:
         raise SplashbenchError(f"{error} (as a scene; a submission would have {IDENTITY})") from None
+
+
+def _open_submission(place: Path, scene: Path | None, method: str | None) -> SubmissionExhibit:
+    try:
+        exhibit = SubmissionExhibit(load(place, scene, method=method))
+        _ = exhibit.extent  # asks the model, too
+    except SplashbenchError:
+        raise
+    except Exception as error:  # a method's code
+        said = one_line(f"{type(error).__name__}: {error}")[:500]
+        raise SplashbenchError(f"{place}: its model fails ({said}); run the method again") from error
+    return exhibit
 
 
 def require_same_rig(first: Exhibit, second: Exhibit) -> None:

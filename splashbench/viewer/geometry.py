@@ -27,11 +27,6 @@ def quaternion(rotation: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_matrix(np.asarray(rotation)).as_quat()[[3, 0, 1, 2]])
 
 
-def rotation_of(wxyz: ArrayLike) -> NDArray[np.float64]:
-    """The rotation [3, 3] of a quaternion w, x, y, z."""
-    return np.asarray(Rotation.from_quat(np.asarray(wxyz, dtype=np.float64)[[1, 2, 3, 0]]).as_matrix())
-
-
 def turned_to(up: ArrayLike) -> NDArray[np.float64]:
     """A rotation [3, 3] that turns the z axis to `up` [3]."""
     z = np.asarray(up, dtype=np.float64) / np.linalg.norm(np.asarray(up, dtype=np.float64))

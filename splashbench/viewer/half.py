@@ -11,6 +11,7 @@ from typing import Any
 
 from splashbench.viewer.exhibit import Exhibit
 from splashbench.viewer.geometry import View, client_view, overview, set_client_view
+from splashbench.viewer.layers import Moment
 from splashbench.viewer.merging import Lookout
 from splashbench.viewer.stage import Stage
 
@@ -84,13 +85,14 @@ class Half:
         """The stage that is shown."""
         return self.stages[self.chosen]
 
-    def choose(self, number: int) -> None:
-        """Show exhibit `number`."""
-        before = self.stage
-        self.chosen = number
-        self.stage.show(before.moment)
+    def choose(self, number: int, moment: Moment) -> None:
+        """Show exhibit `number` at its `moment`."""
         for index, stage in enumerate(self.stages):
-            stage.set_visible(index == number)
+            if index != number:  # first, as what is behind the scene is one for all stages
+                stage.set_visible(False)
+        self.chosen = number
+        self.stage.show(moment)
+        self.stage.set_visible(True)
 
     def clients(self) -> list[Any]:
         """Those that look."""

@@ -66,7 +66,7 @@ class Layer(ABC):
         """What may be made for later, or None."""
         return None
 
-    def settings_changed(self, moment: Moment) -> None:  # noqa: B027
+    def settings_changed(self) -> None:  # noqa: B027
         """Forget what was made with other settings, such as colours."""
 
     @property
@@ -183,7 +183,7 @@ class TimedLayer(Layer):
                 if gone is not None:
                     gone.remove()
 
-    def settings_changed(self, moment: Moment) -> None:
+    def settings_changed(self) -> None:
         """Remove every node."""
         with self._lock:
             self._version += 1

@@ -235,8 +235,9 @@ class Panel:
         lines = []
         for half in viewer.halves:
             for layer in half.stage.layers.values():
-                if layer.loading is not None:
-                    lines.append(f"Loading {layer.title}: {layer.loading[0]} of {layer.loading[1]} timesteps.")
+                loading = layer.loading  # read once: the worker goes on meanwhile
+                if loading is not None:
+                    lines.append(f"Loading {layer.title}: {loading[0]} of {loading[1]} timesteps.")
             lines += half.stage.remarks()
         _set(self._status, "\n\n".join(_plain(line) for line in dict.fromkeys(lines)))
         _set(self._head, self._description())

@@ -73,14 +73,11 @@ class PictureLayer(Layer):
         self._made.clear()
 
     def urgent(self, moment: Moment) -> Job | None:
-        """The picture of a client that shows another view or timestep."""
-        return self._job(moment, lambda made, view, width: made is None or not made.is_of(view, moment.t))
-
-    def ahead(self, moment: Moment) -> Job | None:
-        """The finer picture of a client at rest."""
-        if moment.playing:
-            return None
-        return self._job(moment, lambda made, view, width: made is None or made.width < width, rest=True)
+        """The picture of a client that shows another view or timestep; at rest, then the finer one."""
+        quick = self._job(moment, lambda made, view, width: made is None or not made.is_of(view, moment.t))
+        if quick is not None or moment.playing:
+            return quick
+        return self._job(moment, lambda made, view, width: made is not None and made.width < width, rest=True)
 
     def _job(self, moment: Moment, wanted: Callable[[_Made | None, View, int], bool], rest: bool = False) -> Job | None:
         if not self.on:

@@ -2,7 +2,7 @@
 
 viser's client merges and sorts all Gaussians it holds, invisible ones too. A graphics card does not notice 600 000 of
 them; drawing without one takes a second for 20 000. So timesteps are sent ahead to clients that draw fast, within a
-budget, and other clients get the one that is shown. A paused clock shows the whole of a model that is thinned.
+budget, and other clients get the one that is shown. A paused clock shows more of a model that is thinned.
 What is small from where clients look is merged first (merging.py), and anew when they come nearer or go farther.
 """
 
@@ -23,7 +23,7 @@ from splashbench.viewer.splats import PackedGaussians, pack, sound, unit_of
 
 #: Gaussians that are sent ahead, in all timesteps together: 50 timesteps of 12 000.
 BUDGET = 600_000
-#: Gaussians of a timestep that is sent as it is shown.
+#: Gaussians of a timestep, at the most.
 MOST_AT_ONCE = 300_000
 # A group that is exchanged keeps its size; where a timestep has more, it gets so much room to spare.
 _ROOM = 1.25
@@ -59,7 +59,7 @@ class SplatLayer(Layer):
         self._scene, self._place, self._atomic = scene, place, atomic
         self._frames, self._n_frames = frames, n_frames
         self._lookout, self._middle = lookout, middle
-        self._each = max(1, budget // n_frames)
+        self._each = min(max(1, budget // n_frames), MOST_AT_ONCE)
         self._send_ahead = False
         self._unit: float | None = None
         self._nodes: dict[int, Any] = {}
@@ -153,7 +153,8 @@ class SplatLayer(Layer):
             self._unit = unit_of(gaussians)
         fewer = merged(gaussians, lookout)
         packed = pack(fewer, self._unit or 1.0, most)
-        self._counts[t] = len(gaussians), len(fewer)
+        with self._lock:
+            self._counts[t] = len(gaussians), len(fewer)
         # A group without Gaussians is one that the client cannot draw.
         return packed if len(packed) else packed.padded(1)
 
@@ -197,17 +198,18 @@ class SplatLayer(Layer):
     @property
     def loading(self) -> tuple[int, int] | None:
         """Timesteps that are sent, and T."""
-        if not (self.on and self._send_ahead) or len(self._nodes) == self._n_frames:
-            return None
-        return len(self._nodes), self._n_frames
+        with self._lock:
+            there = len(self._nodes)
+            return (there, self._n_frames) if self.on and self._send_ahead and there < self._n_frames else None
 
     @property
     def remark(self) -> str:
         """Which part of the Gaussians is shown."""
-        if not self.on or self._t not in self._counts:
-            return ""
-        whole, fewer = self._counts[self._t]
-        most = max(fewer for _, fewer in self._counts.values())
+        with self._lock:
+            if not self.on or self._t not in self._counts:
+                return ""
+            whole, fewer = self._counts[self._t]
+            most = max(fewer for _, fewer in self._counts.values())
         said = []
         if fewer < whole:
             said.append(
@@ -215,7 +217,8 @@ class SplatLayer(Layer):
                 "this far; come nearer and there are more."
             )
         if self._send_ahead and most > self._each:
-            said.append(f"While it plays, {self._each} of up to {most} are shown; paused, all of them.")
+            paused = "all of them" if most <= MOST_AT_ONCE else f"at most {MOST_AT_ONCE}"
+            said.append(f"While it plays, {self._each} of up to {most} are shown; paused, {paused}.")
         elif most > MOST_AT_ONCE:
             said.append(f"{MOST_AT_ONCE} of up to {most} are shown.")
         return " ".join(said)

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.scene import Gaussians
+from splashbench.submission import to_8bit
 
-#: Of a Gaussian on its way to the client and in it.
-BYTES_EACH = 32
-# The largest standard deviation in the unit that is sent. Its square leaves the 16-bit float (65504) room for later
-# frames with larger ones, and standard deviations down to a 2000th keep all of its digits.
+# The largest standard deviation in the unit that is sent, but for a few larger ones. Its square leaves the 16-bit float
+# (65504) room for those and for later frames, and standard deviations down to a 2000th keep all of its digits.
 _LARGEST = 16.0
 _MOST = 250.0
+# Percent of the Gaussians that the unit suits: one of a stranger's may be huge, and the others would vanish beside it.
+_SUITED = 99.0
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,12 @@ class PackedGaussians:
 
 def unit_of(gaussians: Gaussians) -> float:
     """The unit to send `gaussians` in, scene units: a power of two, so that no place is rounded by it."""
-    variances = np.trace(gaussians.covariances, axis1=1, axis2=2)
-    largest = math.sqrt(float(variances.max())) if len(variances) else 0.0
-    return 2.0 ** math.ceil(math.log2(largest / _LARGEST)) if largest > 0 else 1.0
+    variances = np.trace(gaussians.covariances, axis1=1, axis2=2, dtype=np.float64)
+    variances = variances[variances > 0]
+    if not len(variances):
+        return 1.0
+    large = math.sqrt(float(np.percentile(variances, _SUITED, method="lower")))
+    return 2.0 ** math.ceil(math.log2(large / _LARGEST))
 
 
 def sound(gaussians: Gaussians) -> Gaussians:
@@ -83,7 +87,9 @@ def sound(gaussians: Gaussians) -> Gaussians:
     if not len(gaussians):
         return gaussians
     finite = np.isfinite(gaussians.opacities)
-    for array in (gaussians.means, gaussians.factors, gaussians.colors):
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariances = gaussians.covariances
+    for array in (gaussians.means, gaussians.factors, gaussians.colors, covariances):
         finite &= np.isfinite(array.reshape(len(gaussians), -1)).all(axis=1)
     return gaussians if finite.all() else gaussians.kept(finite)
 
@@ -94,15 +100,15 @@ def pack(gaussians: Gaussians, scale: float, most: int) -> PackedGaussians:
     A Gaussian too large for the format is made as large as the format allows.
     """
     shown = gaussians.kept(most_visible(gaussians, most)) if len(gaussians) > most else gaussians
-    covariances = shown.covariances / np.float32(scale) ** 2
+    covariances = shown.covariances.astype(np.float64) / scale**2
     spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     too_large = spread > _MOST
     covariances[too_large] *= (_MOST / spread[too_large, None, None]) ** 2
     return PackedGaussians(
         shown.means / np.float32(scale),
-        covariances,
-        _to_8bit(shown.colors),
-        _to_8bit(shown.opacities)[:, None],
+        covariances.astype(np.float32),
+        to_8bit(shown.colors),
+        to_8bit(shown.opacities)[:, None],
         scale,
         len(gaussians) - len(shown),
     )
@@ -114,7 +120,3 @@ def most_visible(gaussians: Gaussians, number: int) -> NDArray[np.int64]:
     if number >= len(weight):
         return np.arange(len(weight))
     return np.sort(np.argpartition(weight, len(weight) - number)[len(weight) - number :])
-
-
-def _to_8bit(values: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)

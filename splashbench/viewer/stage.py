@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from splashbench.export.surface import surface_mesh
 from splashbench.scene import Gaussians, SignedDistance
+from splashbench.submission import to_8bit
 from splashbench.viewer.camera_layer import CameraLayer
 from splashbench.viewer.coloring import PLAIN, colors_of
 from splashbench.viewer.cuts import cut
@@ -82,7 +83,7 @@ class Stage:
         self._ground: NDArray[np.uint8] | None = None
         self.layers: dict[str, Layer] = {layer.name: layer for layer in self._make_layers(clicked)}
 
-    # What there is of an exhibit is known without making it; a layer that then finds nothing says so.
+    # What there is of an exhibit is known from its opening; a layer that then finds nothing says so.
     def _make_layers(self, clicked: Callable[[Any, str], None]) -> list[Layer]:
         shown, lock = self.exhibit, self._lock
         middle, frames = self._extent.middle, shown.n_frames
@@ -162,17 +163,25 @@ class Stage:
 
     def _show_ground(self, visible: bool) -> None:
         """Show what is behind everything where the background is, as it has gaps."""
-        background = self.layers.get("background")
-        shown = visible and background is not None and background.on and self._ground_color is not None
-        ground = self._ground_color[None, None] if shown and self._ground_color is not None else None
-        if (ground is None) != (self._ground is None):
-            self._ground = ground
-            self._scene.set_background_image(ground, format="png")
+        with self._lock:
+            background = self.layers.get("background")
+            shown = visible and background is not None and background.on and self._ground_color is not None
+            ground = self._ground_color[None, None] if shown and self._ground_color is not None else None
+            if (ground is None) != (self._ground is None):
+                self._ground = ground
+                self._scene.set_background_image(ground, format="png")
 
     def switch(self, name: str, on: bool) -> None:
         """Show or hide the layer `name`, where there is one."""
         if name in self.layers:
-            self.layers[name].switch(on, self._moment)
+            with self._lock:
+                self.layers[name].switch(on, self._moment)
+                self._show_ground(self._frame.visible)
+
+    def fail(self, layer: Layer, fault: str) -> None:
+        """Take `layer` out, because of `fault`."""
+        with self._lock:
+            layer.fail(fault, self._moment)
             self._show_ground(self._frame.visible)
 
     def look_through(self, looks: bool) -> None:
@@ -191,7 +200,8 @@ class Stage:
         """Send the liquid's Gaussians of all timesteps, or of the one that is shown."""
         layer = self.layers.get("liquid")
         if isinstance(layer, SplatLayer) and layer.send_ahead != ahead:
-            layer.set_send_ahead(ahead, self._moment)
+            with self._lock:
+                layer.set_send_ahead(ahead, self._moment)
 
     def set(self, **changes: Any) -> None:
         """Change `settings`, and make anew what depends on them."""
@@ -201,7 +211,7 @@ class Stage:
             touched += ["cut"] if (before.axis, before.share) != (self.settings.axis, self.settings.share) else []
             for name in touched:
                 if name in self.layers:
-                    self.layers[name].settings_changed(self._moment)
+                    self.layers[name].settings_changed()
             self.show(self._moment)
 
     def jobs(self, urgent: bool) -> list[tuple[Layer, Job]]:
@@ -212,8 +222,9 @@ class Stage:
 
     def done(self) -> None:
         """Show what a job has made."""
-        self.show(self._moment)
-        self._show_ground(self._frame.visible)
+        with self._lock:  # else the clock's thread may go on between the look at the moment and its being shown
+            self.show(self._moment)
+            self._show_ground(self._frame.visible)
 
     def remarks(self) -> list[str]:
         """Sentences on what is shown coarser than it is, and on what cannot be shown."""
@@ -253,8 +264,7 @@ class Stage:
         points = self.exhibit.static_points()
         if points is None or not len(points):
             return []
-        colors = np.rint(np.clip(points[:, 3:6], 0, 1) * 255).astype(np.uint8)
-        return [self._points("points", points[:, :3], colors, 0.006)]
+        return [self._points("points", points[:, :3], to_8bit(points[:, 3:6]), 0.006)]
 
     def _points(self, name: str, positions: NDArray, colors: NDArray[np.uint8], share: float) -> Any:
         return self._scene.add_point_cloud(
@@ -444,7 +454,7 @@ class CutLayer(Layer):
         with self._lock:
             self._node, self._made = node, moment.t if version == self._version else None
 
-    def settings_changed(self, moment: Moment) -> None:
+    def settings_changed(self) -> None:
         """Make it anew."""
         with self._lock:
             self._version += 1

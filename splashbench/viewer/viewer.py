@@ -20,6 +20,7 @@ from splashbench.viewer.half import Half
 from splashbench.viewer.keyframes import FPS, MOST_KEYFRAMES, Keyframe, path_through
 from splashbench.viewer.layers import Layer, Moment
 from splashbench.viewer.server import address_of, free_port, on_free_port, start_server
+from splashbench.viewer.stage import Stage
 from splashbench.viewer.window import WindowServer
 from splashbench.viewer.worker import Worker
 
@@ -102,12 +103,15 @@ class Viewer:
         self._looked_through: str | None = None
         self._window: WindowServer | None = None
         self._servers: list[Any] = []
+        self.halves: list[Half] = []
+        self._worker = Worker(self._next_job)
+        # Whether all of what is shown is made; how often somebody said that there may be more to make.
+        self._ready, self._ready_lock, self._calls = threading.Event(), threading.Lock(), 0
         try:
+            # From here on pages may connect.
             self.port = self._serve(exhibits, port)
-            self.halves = [
-                Half(server, exhibits, number, self._clicked, self._moved, self._connected)
-                for number, server in enumerate(self._servers)
-            ]
+            for number, server in enumerate(self._servers):
+                self.halves.append(Half(server, exhibits, number, self._clicked, self._moved, self._connected))
             if on is not None:
                 self._choose_layers(on)
         except BaseException:
@@ -116,9 +120,6 @@ class Viewer:
         for half in self.halves:
             for stage in half.stages:
                 stage.send_ahead(bool(send_ahead))
-        self._worker = Worker(self._next_job)
-        # Whether all of what is shown is made; how often somebody said that there may be more to make.
-        self._ready, self._ready_lock, self._calls = threading.Event(), threading.Lock(), 0
 
     @property
     def address(self) -> str:
@@ -177,18 +178,14 @@ class Viewer:
 
     def tick(self) -> None:
         """Show the timestep whose turn it is."""
-        t, playing = self.clock.tick(), self.clock.playing
+        t, seconds, playing = self.clock.read()
         if (t, playing) == self._shown:
             return
         self._shown = (t, playing)
         for half in self.halves:
-            half.stage.show(self._moment(half))
-        self.display.show_time(t, self.clock.seconds, playing)
+            half.stage.show(Moment(half.stage.exhibit.nearest(seconds), playing))
+        self.display.show_time(t, seconds, playing)
         self._wake()
-
-    def _moment(self, half: Half) -> Moment:
-        """What the half shows: its exhibit's timestep nearest to the clock's time."""
-        return Moment(half.stage.exhibit.nearest(self.clock.seconds), self.clock.playing)
 
     def changed(self) -> None:
         """Something was changed by hand: look at the clock, at what is missing and at what is said."""
@@ -229,8 +226,9 @@ class Viewer:
         calls = self._calls
         for urgent in (True, False):
             for half in self.halves:
-                for layer, job in half.stage.jobs(urgent):
-                    return lambda half=half, layer=layer, job=job: self._work(half, layer, job)  # type: ignore[misc]
+                stage = half.stage
+                for layer, job in stage.jobs(urgent):
+                    return lambda half=half, stage=stage, layer=layer, job=job: self._work(half, stage, layer, job)  # type: ignore[misc]
             if urgent:
                 with self._ready_lock:
                     if calls == self._calls:  # else there may be more by now
@@ -240,16 +238,17 @@ class Viewer:
         self.display.refresh()
         return None
 
-    def _work(self, half: Half, layer: Layer, job: Callable[[], None]) -> None:
-        """Run a job. What fails takes its layer out: the rest is still worth looking at."""
+    def _work(self, half: Half, stage: Stage, layer: Layer, job: Callable[[], None]) -> None:
+        """Run a job, and show what it made. What fails takes its layer out: the rest is still worth looking at."""
         try:
             job()
+            stage.done()
+            self.display.refresh_soon()
         except Exception as error:  # a method's code, or a stranger's files
             said = str(error) if isinstance(error, SplashbenchError) else f"{type(error).__name__}: {error}"
-            layer.fail(one_line(said)[:500], half.stage.moment)
+            stage.fail(layer, one_line(said)[:500])
             self.display.show_layers(half)
-        half.stage.done()
-        self.display.refresh_soon()
+            self.display.refresh_soon()
 
     # What the panel asks for.
 
@@ -278,8 +277,8 @@ class Viewer:
 
     def choose(self, half: Half, number: int) -> None:
         """Show exhibit `number` in `half`."""
-        half.choose(number)
-        half.stage.show(self._moment(half))
+        _, seconds, playing = self.clock.read()
+        half.choose(number, Moment(half.stages[number].exhibit.nearest(seconds), playing))
         self.display.show_layers(half)
 
     def set_sending(self, ahead: bool | None) -> None:
@@ -418,12 +417,12 @@ class Viewer:
         exhibit = self.halves[0].stage.exhibit
         try:
             while not stopped.wait(1 / FPS):
-                number = int((time.monotonic() - start) * FPS)
-                if number >= len(frames):
-                    break
+                number = min(int((time.monotonic() - start) * FPS), len(frames) - 1)
                 self.clock.seek(exhibit.nearest(frames[number].time))
                 self._changed.set()
                 self._go(client, frames[number].view, None)
+                if number == len(frames) - 1:
+                    break
         finally:
             if self._path_played is stopped:
                 self._path_played = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
@@ -40,8 +41,9 @@ class WindowServer:
         frames = "\n".join(
             f'<iframe data-port="{int(each)}" title="{html.escape(name)}"></iframe>' for each, name in zip(ports, names)
         )
-        page = _PAGE.replace("PANEL", str(PANEL_WIDTH // 2)).replace("HEADINGS", headings).replace("FRAMES", frames)
-        content = page.encode()
+        parts = {"PANEL": str(PANEL_WIDTH // 2), "HEADINGS": headings, "FRAMES": frames}
+        # In one pass: a name may hold such a word.
+        content = re.sub("|".join(parts), lambda found: parts[found[0]], _PAGE).encode()
 
         class Exchange(BaseHTTPRequestHandler):
             """Answers with the page."""

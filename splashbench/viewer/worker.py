@@ -1,10 +1,11 @@
 """The worker: one thread on which everything slow is made, the most urgent first.
 
-Models are asked on this thread alone, so that no two questions reach one at the same time.
+Once the viewer runs, models are asked on this thread alone, so that no two questions reach one at the same time.
 """
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 
@@ -51,9 +52,7 @@ class Worker:
                 self._called = False
                 if self._stopped:
                     return
-            job = self._next_job()
-            if job is not None:
-                job()
+            if self._do_next():
                 continue
             with self._state:
                 # A call that came while it looked for work may be of work that it did not see.
@@ -61,3 +60,14 @@ class Worker:
                     self._idle = True
                     self._state.notify_all()
                     self._state.wait_for(lambda: self._called or self._stopped)
+
+    def _do_next(self) -> bool:
+        """Do the next piece of work; whether there was one. One that raises is told, and waits for the next call."""
+        try:
+            job = self._next_job()
+            if job is not None:
+                job()
+            return job is not None
+        except Exception as error:
+            print(f"the viewer could not do that: {type(error).__name__}: {error}", file=sys.stderr)
+            return False

@@ -165,3 +165,20 @@ def test_an_interrupted_export_leaves_nothing(exact: Path, tmp_path: Path) -> No
     assert process.returncode == 130
     assert "Traceback" not in printed
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_no_usd_file(exact: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core, which the extra [usd] installs")
+    (place := tmp_path / "place").mkdir()
+    # As large as a disk that is nearly full. Python would cache half a module, and load it from then on.
+    code = (
+        "import resource, sys; sys.dont_write_bytecode = True; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); "
+        "from splashbench.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    words = export(exact, place / "out", "--format", "mesh", "--mesh-format", "usd")
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1, done.stderr
+    assert "could not be written: the disk is full; free some space" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert list(place.iterdir()) == []

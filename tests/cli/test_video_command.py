@@ -17,6 +17,7 @@ import pytest
 from splashbench.cli.main import main
 from splashbench.cli.video import LAYERS
 from splashbench.harness.runner import run_method
+from splashbench.scene import Scene
 from splashbench.submission import Submission
 from splashbench.video import layers
 
@@ -64,8 +65,22 @@ def test_a_scene_is_needed_for_photographs_alone(
     assert height > 64
     assert main(["video", str(points), str(tmp_path / "b.gif"), *scene, "--wipe", "truth", "--divider", "0.5"]) == 0
     assert main(["video", str(points), str(tmp_path / "c"), *scene, "--layer", "error", "--range", "0", "1"]) == 0
+    told = json.loads((tmp_path / "c" / "frames.json").read_text())
     assert main(["video", str(points), str(tmp_path / "c"), "--orbit", "--orbit-height", "20", "--replace"]) == 0
-    assert not (tmp_path / "c" / "000010.png").is_symlink()
+    orbit = json.loads((tmp_path / "c" / "frames.json").read_text())
+    assert (told["panels"], orbit["panels"]) == (["hull_points, error"], ["hull_points"])
+    assert len(list((tmp_path / "c").glob("*.png"))) == orbit["frames"]
+
+
+def test_a_scene_is_opened_once_for_all_that_are_compared(
+    points: Path, truth: Path, balls_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+    real = Scene.open
+    monkeypatch.setattr(Scene, "open", lambda path, *more, **named: opened.append(path) or real(path, *more, **named))
+    words = ["--scene", str(balls_directory), "--beside", str(truth), str(points), "--end", "0.1"]
+    assert main(["video", str(points), str(tmp_path / "a.mp4"), *words]) == 0
+    assert opened == [balls_directory]
 
 
 def test_a_fitted_submission_is_as_it_was(points: Path, tmp_path: Path) -> None:

@@ -140,6 +140,12 @@ def test_what_is_refused_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_method_of_none_of_the_places_is_one_line(balls_directory: Path, truth: Path, fails: Fails) -> None:
+    method = f"{Path(__file__).parents[2] / 'methods' / 'hull_points' / 'hull_points.py'}:HullPoints"
+    line = fails("view", balls_directory, truth, "--method", method, "--no-open")
+    assert line.endswith("is 'hull_points', and nothing that is to be seen is of it; leave it out")
+
+
 def test_a_folder_for_screenshots_that_is_a_file_is_refused(
     balls_directory: Path, fails: Fails, tmp_path: Path
 ) -> None:
@@ -154,6 +160,7 @@ def test_a_folder_for_screenshots_that_is_a_file_is_refused(
         (["a", "--camera", "1"], "--camera is for --screenshot"),
         (["a", "--time", "nan"], "'nan' is not a number of seconds"),
         (["a", "--port", "0"], "'0' is not a whole number from 1 to 65535"),
+        (["a", "b", "--screenshot", "c.png", "--size", "451x300"], "--size: a width of 451 does not halve"),
     ],
 )
 def test_wrong_usage(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

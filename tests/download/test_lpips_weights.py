@@ -242,7 +242,9 @@ def test_files_by_hand_that_are_missing_or_no_weights_are_one_line(
     )
     for content in (b"", b"<html>log in</html>", (other / ALEXNET_FILE).read_bytes()[:10_000]):
         (given / HEADS_FILE).write_bytes(content)
-        assert f"{given / HEADS_FILE} " in refused(capsys, *COMMAND, "--from", given)
+        line = refused(capsys, *COMMAND, "--from", given)
+        assert f"{given / HEADS_FILE} " in line
+        assert "--lpips-weights" not in line  # an option of other commands
     (given / HEADS_FILE).write_bytes((other / ALEXNET_FILE).read_bytes())
     assert "lacks the weights lin0.model.1.weight" in refused(capsys, *COMMAND, "--from", given)
     assert left(tmp_path / "caches") == []

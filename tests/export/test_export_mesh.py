@@ -193,7 +193,7 @@ def test_usd_has_every_instant_with_units_and_velocities(
     codes = mesh.GetPointsAttr().GetTimeSamples()
     fps = stage.GetTimeCodesPerSecond()
     np.testing.assert_allclose((np.array(codes) - 1) / fps, known.times - known.times[0], atol=1e-4)
-    assert len(mesh.GetPointsAttr().Get(codes[0])) == 0
+    assert len(mesh.GetPointsAttr().Get(codes[0])) == len(mesh.GetVelocitiesAttr().Get(codes[0])) == 0
     stored = read_points(folder / "frames" / "frame0006.ply")
     x, y, z = columns(stored, "x", "y", "z").T
     np.testing.assert_allclose(mesh.GetPointsAttr().Get(codes[5]), np.stack([x, -z, y], axis=1), atol=1e-6)
@@ -204,6 +204,24 @@ def test_usd_has_every_instant_with_units_and_velocities(
     assert closed.is_watertight
     assert closed.volume > 0
     assert set(mesh.GetFaceVertexCountsAttr().Get(codes[5])) == {3}
+
+
+def test_usd_of_a_method_without_a_velocity_says_none(known: Reconstruction, tmp_path: Path) -> None:
+    pxr = pytest.importorskip("pxr.Usd", reason="needs usd-core, which the extra [usd] installs")
+
+    class Still(ExactBalls):
+        def velocity(self, time: float) -> VelocityField | None:  # type: ignore[override]
+            return None
+
+    export_meshes(showing(known, Still(known.times)), tmp_path / "usd", mesh_format="usd")
+    stage = pxr.Stage.Open(str(tmp_path / "usd" / "liquid.usdc"))
+    assert not stage.GetDefaultPrim().GetAttribute("velocities").HasAuthoredValue()
+
+
+def test_a_frame_without_liquid_has_the_columns_of_the_others(folder: Path) -> None:
+    heads = [(folder / "frames" / name).read_bytes()[:600] for name in ("frame0001.ply", "frame0006.ply")]
+    assert b"element vertex 0\n" in heads[0]
+    assert [head.count(b"property float v") for head in heads] == [3, 3]
 
 
 def test_without_usd_core_one_line_names_the_extra(

@@ -95,7 +95,7 @@ class TestParticles:
         with pytest.raises(SplashbenchError, match="has no particles: method exact hands out none; export its mesh"):
             export_particles(opened, tmp_path / "out")
         opened.__dict__["_particles"] = Particles(np.zeros((3, 1, 3)), np.ones((3, 1), bool))
-        with pytest.raises(SplashbenchError, match=r"particles.npz has 3 instants, its scene 8"):
+        with pytest.raises(SplashbenchError, match=r"particles.npz has 3 instants, and its scene 8"):
             export_particles(opened, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
@@ -350,3 +350,15 @@ class TestManifest:
         names = frame_files(12_000, "ply")
         assert (names[0], names[-1]) == ("frames/frame00001.ply", "frames/frame12000.ply")
         assert names == sorted(names)
+
+
+@pytest.mark.parametrize(
+    ("units", "remedy"), [("metres", "leave --metres out, or fit again"), ("scene units", "fit again")]
+)
+def test_places_beyond_all_bounds_are_one_line(units: str, remedy: str) -> None:
+    placement = Placement(scale=1e9, units=units)  # type: ignore[arg-type]
+    assert placement.points(np.full((2, 3), 1e20)).max() == pytest.approx(1e29)
+    assert placement.points(np.zeros((0, 3))).shape == (0, 3)
+    for value in (1e22, 1e305, np.inf, np.nan):
+        with pytest.raises(SplashbenchError, match=f"beyond 1e\\+30 {units}, or NaN; {remedy}$"):
+            placement.points(np.array([[0.0, value, 0.0]]))

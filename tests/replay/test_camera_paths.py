@@ -201,6 +201,13 @@ def test_an_orbit_of_ones_own_extent_and_height() -> None:
     assert all(np.isfinite(camera.w2c).all() for camera in steep.cameras)
 
 
+def test_cameras_in_one_direction_have_no_arc_of_their_own() -> None:
+    for rig in (ring([20]), ring([20, 20])):
+        with pytest.raises(SplashbenchError, match="give the orbit's own \\(--orbit-degrees\\)"):
+            orbit(rig, [1, 2, 3], [0, 1, 0], 12)
+        assert np.ptp(around(orbit(rig, [1, 2, 3], [0, 1, 0], 12, degrees=40))) == pytest.approx(40, abs=1e-6)
+
+
 def test_no_orbit_goes_around_what_all_cameras_look_down_on() -> None:
     with pytest.raises(SplashbenchError, match="above or below the liquid"):
         orbit(ring([0], height=90), [1, 2, 3], [0, 1, 0], 3)

@@ -13,7 +13,7 @@ import splashbench
 from splashbench.errors import SplashbenchError
 from splashbench.harness.oracle import write_oracle
 from splashbench.harness.runner import run_method
-from splashbench.scene import Scene, SignedDistance
+from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.submission import Record, Status, Submission, seal, to_8bit
 from splashbench.submission.cameras import CAMERAS
 
@@ -283,6 +283,14 @@ def test_cameras_that_make_no_sense_together_are_told(copy: Path, change: object
     with pytest.raises(SplashbenchError, match=fault) as caught:
         splashbench.load(copy, verify=False)
     assert "cameras.json" in str(caught.value)
+
+
+def test_particles_of_other_timesteps_are_told(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = splashbench.load(copy)
+    few = Particles(np.zeros((3, 1, 3), np.float32), np.ones((3, 1), bool))
+    monkeypatch.setattr(opened.submission, "particles", lambda: few)
+    with pytest.raises(SplashbenchError, match=r"particles\.npz has 3 instants, and its scene 8"):
+        opened.particles()
 
 
 def test_geometry_of_other_timesteps_is_told(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,11 +81,29 @@ def test_a_file_that_was_named_must_be_there(tmp_path: Path) -> None:
         load_lpips(tmp_path / "weights.npz")
 
 
-def test_other_weights_are_refused(tmp_path: Path) -> None:
+def made_up() -> dict[str, np.ndarray]:
+    """Arrays of the right shapes, which are no weights."""
     shapes = {1: (64, 3, 11, 11), 2: (192, 64, 5, 5), 3: (384, 192, 3, 3), 4: (256, 384, 3, 3), 5: (256, 256, 3, 3)}
     arrays = {f"conv{i}.weight": np.zeros(shape, np.float32) for i, shape in shapes.items()}
     arrays |= {f"conv{i}.bias": np.zeros(shape[0], np.float32) for i, shape in shapes.items()}
     arrays |= {f"lin{i - 1}": np.zeros(shape[0], np.float32) for i, shape in shapes.items()}
-    np.savez(tmp_path / "made_up.npz", **arrays)
+    return arrays
+
+
+def test_weights_in_the_cache_are_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from splashbench.score.image import weights
+
+    monkeypatch.delenv(module.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setenv("SPLASHBENCH_CACHE", str(tmp_path))
+    np.savez(weights.weights_path(), **made_up())  # type: ignore[arg-type]
+    hashed: list[object] = []
+    for place in (module, weights):
+        monkeypatch.setattr(place, "weights_digest", lambda given: hashed.append(given) or module.WEIGHTS_SHA256)
+    assert load_lpips()[0] is not None
+    assert len(hashed) == 1
+
+
+def test_other_weights_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "made_up.npz", **made_up())  # type: ignore[arg-type]
     with pytest.raises(SplashbenchError, match="not those of AlexNet"):
         load_lpips(tmp_path / "made_up.npz")

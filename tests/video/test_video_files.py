@@ -17,7 +17,7 @@ import pytest
 from splashbench.errors import SplashbenchError
 from splashbench.replay import Reconstruction
 from splashbench.video import TRUTH, Comparison, VideoSettings, encoders, make_film, write_video
-from splashbench.video.output import default_fps, require_place
+from splashbench.video.output import rate_for, require_place
 
 PLAIN = VideoSettings(caption=False)
 
@@ -105,7 +105,7 @@ def test_halves_of_a_file_are_what_was_compared(ball: Reconstruction, tmp_path: 
 
 
 def test_a_gif_plays_at_a_rate_that_gifs_have(ball: Reconstruction, tmp_path: Path) -> None:
-    film = make_film(ball, PLAIN, default_fps=default_fps(tmp_path / "ball.gif"))
+    film = make_film(ball, PLAIN, rate=rate_for(tmp_path / "ball.gif"))
     assert film.timing.fps == pytest.approx(100 / 3)
     write_video(film, tmp_path / "ball.gif")
     frames, _ = decoded(tmp_path / "ball.gif")
@@ -116,6 +116,15 @@ def test_a_gif_plays_at_a_rate_that_gifs_have(ball: Reconstruction, tmp_path: Pa
     with pytest.raises(SplashbenchError, match=r"give --fps 33\.33"):
         write_video(make_film(ball, replace(PLAIN, fps=30)), tmp_path / "no.gif")
     assert [path.name for path in tmp_path.iterdir()] == ["ball.gif"]
+
+
+def test_a_gif_has_the_timesteps_of_a_recording_of_any_rate(ball: Reconstruction, tmp_path: Path) -> None:
+    ball.times = np.arange(8) / 30
+    ball.camera_times = dict.fromkeys(ball.cameras, ball.times)
+    film = make_film(ball, replace(PLAIN, timesteps=True), rate=rate_for(tmp_path / "ball.gif"))
+    write_video(film, tmp_path / "ball.gif")
+    assert len(decoded(tmp_path / "ball.gif")[0]) == 8
+    assert film.timing.fps == pytest.approx(100 / 3)
 
 
 def test_a_folder_has_the_frames_and_their_times(ball: Reconstruction, tmp_path: Path) -> None:

@@ -199,7 +199,10 @@ def test_layers_show_what_their_names_say(ball: Reconstruction, balls: Scene) ->
     center = camera.w2c[:3] @ np.array([-0.1 + 0.5 * 0.2, 0.3, 0, 1])
     nearest = np.nanmin(shot.depth)
     assert nearest == pytest.approx(center[2] - 0.15, abs=0.01)
-    assert low <= nearest < center[2] + 0.15 <= high + 0.2
+    seen = shot.depth[np.isfinite(shot.depth)]
+    assert low <= seen.min()
+    assert seen.max() <= high
+    assert high - low < 2 * np.ptp(seen)
     gray = depth[~inside].astype(int)
     assert (np.ptp(gray, axis=1) == 0).all()  # what is no liquid has no colour
 
@@ -288,6 +291,25 @@ def test_submissions_of_two_scenes_are_not_compared(ball: Reconstruction, tmp_pa
     run_method("oracle", tmp_path / "other", tmp_path / "submission", timing_frames=0)
     with pytest.raises(SplashbenchError, match="compare two of one scene"):
         make_film(ball, PLAIN, Comparison([load(tmp_path / "submission")]))
+
+
+def test_rates_that_nobody_said_are_those_that_the_file_can_have(ball: Reconstruction, tmp_path: Path) -> None:
+    write_camera_path(tmp_path / "path.json", [ball.cameras["1"]] * 3, [0.1, 0.2, 0.3], 30)
+    for changes in ({}, {"timesteps": True}, {"path": tmp_path / "path.json"}):
+        settings = replace(PLAIN, **changes)  # type: ignore[arg-type]
+        plain, made = make_film(ball, settings), make_film(ball, settings, rate=lambda fps: fps + 3)
+        assert made.timing.fps == pytest.approx(plain.timing.fps + 3)
+        assert make_film(ball, replace(settings, fps=12), rate=lambda fps: fps + 3).timing.fps == 12
+
+
+def test_a_photograph_is_read_once_while_it_is_shown(ball: Reconstruction, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = make_film(ball, replace(PLAIN, slow=4, resize=0.5), Comparison([TRUTH]))
+    read: list[int] = []
+    real = Scene.image
+    monkeypatch.setattr(Scene, "image", lambda scene, name, t: read.append(t) or real(scene, name, t))
+    frames = list(film.frames())
+    assert len(frames) > 2 * len(ball.times)
+    assert read == list(range(len(ball.times)))
 
 
 def test_a_path_does_not_leave_the_recording(ball: Reconstruction, tmp_path: Path) -> None:

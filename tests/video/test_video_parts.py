@@ -8,7 +8,7 @@ import pytest
 from splashbench.errors import SplashbenchError
 from splashbench.scene import Camera, look_at
 from splashbench.video.captions import Line, Strip, speed_text
-from splashbench.video.flicker import jitter, subdivided
+from splashbench.video.flicker import second_difference, subdivided
 from splashbench.video.scales import Scale, round_range
 from splashbench.video.timing import Timing
 from splashbench.video.views import looked_at, upright
@@ -112,33 +112,33 @@ def video(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def test_steady_motion_does_not_flicker_and_a_jump_at_timesteps_does() -> None:
     steady = np.linspace(12, 52, 49)
-    smooth = jitter(*video(steady), 8)
+    smooth = second_difference(*video(steady), 8)
     assert smooth.ratio == pytest.approx(1, abs=0.05)
     jumping = steady + 0.4 * (np.arange(49) % 8 == 0)
-    assert jitter(*video(jumping), 8).ratio > 2
-    held = jitter(*video(steady[np.arange(49) // 8 * 8]), 8)
+    assert second_difference(*video(jumping), 8).ratio > 2
+    held = second_difference(*video(steady[np.arange(49) // 8 * 8]), 8)
     assert held.mean > 3 * smooth.mean
     assert held.ratio > 5
     assert np.isnan(smooth.values[[0, -1]]).all()
 
 
-def test_a_blend_of_timesteps_has_all_its_jitter_at_them() -> None:
+def test_a_blend_of_timesteps_has_all_its_second_difference_at_them() -> None:
     rgb, liquid = video(np.linspace(12, 52, 49))
     steps, place = rgb[::8], np.arange(49) / 8
     before = np.minimum(place.astype(int), 5)
     share = (place - before)[:, None, None, None]
-    blended = jitter((1 - share) * steps[before] + share * steps[before + 1], liquid, 8)
+    blended = second_difference((1 - share) * steps[before] + share * steps[before + 1], liquid, 8)
     assert blended.between == pytest.approx(0, abs=1e-9)
     assert blended.seams > 1
 
 
-def test_jitter_is_of_liquid_alone() -> None:
+def test_it_is_of_liquid_alone() -> None:
     rgb, liquid = video(np.full(17, 30.0))
     rgb[::2, :, :5] = 1  # the corner flickers, where no liquid is
-    assert jitter(rgb, liquid, 8).mean == 0
-    assert np.isnan(jitter(rgb, np.zeros_like(liquid), 8).mean)
+    assert second_difference(rgb, liquid, 8).mean == 0
+    assert np.isnan(second_difference(rgb, np.zeros_like(liquid), 8).mean)
     with pytest.raises(ValueError, match="three frames"):
-        jitter(rgb[:2], liquid[:2], 8)
+        second_difference(rgb[:2], liquid[:2], 8)
 
 
 def test_instants_divide_uneven_steps_evenly() -> None:

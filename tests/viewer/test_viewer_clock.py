@@ -112,6 +112,15 @@ def test_seeking_plays_on_from_there(clock: PlayClock, now: Now) -> None:
     assert clock.seconds == 0.4
 
 
+def test_all_of_it_is_of_one_moment(clock: PlayClock, now: Now) -> None:
+    clock.play()
+    now.seconds += 0.15
+    assert clock.read() == (1, 0.1, True)
+    clock.loop = False
+    now.seconds += 7
+    assert clock.read() == (3, 0.4, False)
+
+
 def test_it_says_how_long_until_the_next(clock: PlayClock, now: Now) -> None:
     clock.speed = 0.5
     clock.play()

@@ -93,6 +93,18 @@ def test_a_method_that_withheld_timesteps_shows_the_photographs_of_its_own(
         np.testing.assert_array_equal(exhibit.photograph("1", t), balls.image("1", at))
 
 
+@pytest.mark.parametrize("what", ["gaussians", "velocity", "_some_points"])
+def test_a_model_that_fails_at_opening_is_one_line(points: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("one\ntwo")
+
+    monkeypatch.setattr(SubmissionExhibit, what, broken)
+    with pytest.raises(
+        SplashbenchError, match=r"points: its model fails \(RuntimeError: one two\); run the method again"
+    ):
+        open_exhibit(points)
+
+
 def test_particles_of_another_number_of_timesteps_are_refused(points: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exhibit = SubmissionExhibit(splashbench.load(points))
     particles = exhibit.reconstruction.submission.particles()

@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.viewer.geometry import View, client_view
+from splashbench.viewer.geometry import client_view
+from splashbench.viewer.half import Half
+from splashbench.viewer.layers import Moment
 from splashbench.viewer.panel import SENDING, Panel, _plain
+from splashbench.viewer.server import free_port
 from splashbench.viewer.viewer import Viewer, on_white
 
 from .conftest import MadeUp
@@ -198,9 +201,78 @@ def test_layers_by_name(made_up: MadeUp) -> None:
 
 
 def test_a_port_that_failed_is_free_again(made_up: MadeUp) -> None:
+    port = free_port("127.0.0.1", None)
     for _ in range(2):
         with pytest.raises(SplashbenchError, match="no layer"):
-            Viewer([made_up], port=None, on=["x"])
+            Viewer([made_up], port=port, on=["x"])
+
+
+def test_a_page_that_connects_while_the_viewer_is_built_is_welcome(
+    made_up: MadeUp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = Client(0)
+
+    class Awaited(Half):
+        def __init__(self, *words: Any) -> None:
+            super().__init__(*words)
+            self._welcome(client)
+            client.camera.callback(client.camera)
+            client.camera.move(0.7)
+
+    monkeypatch.setattr("splashbench.viewer.viewer.Half", Awaited)
+    Viewer([made_up], send_ahead=True).stop()
+    np.testing.assert_allclose(client.camera.position, [0.7, 0.5, 2.0])
+
+
+def test_a_tick_reads_the_clock_once(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    done(viewer)
+    reads = iter([(1, 0.1, True), (2, 0.3, True)])
+    monkeypatch.setattr(viewer.clock, "read", lambda: next(reads))
+    monkeypatch.setattr(viewer.clock, "tick", lambda: pytest.fail("another read"))
+    viewer.tick()
+    assert viewer.halves[0].stage.moment == Moment(1, True)
+    assert isinstance(viewer.display, Panel)
+    assert viewer.display._slider.value == 1
+
+
+def test_what_fails_as_it_is_shown_does_not_end_the_worker(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    done(viewer)
+    stage = viewer.halves[0].stage
+
+    def broken() -> None:
+        monkeypatch.undo()
+        raise RuntimeError("it went away")
+
+    monkeypatch.setattr(stage, "done", broken)
+    viewer.switch(viewer.halves[0], "surface", True)
+    viewer.changed()
+    done(viewer)
+    assert stage.layers["surface"].fault == "RuntimeError: it went away"
+    viewer.switch(viewer.halves[0], "particles", True)
+    viewer.changed()
+    done(viewer)
+    assert "particles/timestep 0" in visible(viewer)
+
+
+def test_a_panel_that_fails_does_not_end_the_worker(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done(viewer)
+
+    def broken() -> None:
+        monkeypatch.undo()
+        raise RuntimeError("no panel")
+
+    monkeypatch.setattr(viewer.display, "refresh", broken)
+    viewer._wake()
+    end = time.monotonic() + 20
+    while viewer.display.refresh is broken and time.monotonic() < end:
+        time.sleep(0.01)
+    viewer.switch(viewer.halves[0], "particles", True)
+    viewer.changed()
+    done(viewer)
+    assert "particles/timestep 0" in visible(viewer)
+    assert "the viewer could not do that: RuntimeError: no panel" in capsys.readouterr().err
 
 
 def test_times_that_do_not_rise_are_one_line() -> None:
@@ -269,6 +341,37 @@ def test_a_half_shows_the_other_exhibit(pair: Viewer) -> None:
     assert nodes["/exhibit 1"].visible
 
 
+def test_choosing_one_and_back_keeps_what_is_behind_it(pair: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in (1, 0):
+        pair.choose(pair.halves[0], number)
+        pair.changed()
+        done(pair)
+    told: list[Any] = []
+    scene = pair.halves[0].server.scene
+    monkeypatch.setattr(scene, "set_background_image", lambda image, **_: told.append(image))
+    for number in (1, 0):
+        pair.choose(pair.halves[0], number)
+        assert told[-1].tolist() == [[[200, 150, 100]]], number
+
+
+def test_an_exhibit_of_fewer_timesteps_is_shown_at_the_same_time() -> None:
+    short = MadeUp(times=np.array([0.0, 0.3]))
+    viewer = Viewer([MadeUp(), short], send_ahead=False, on=["particles", "velocity", "cameras"])
+    try:
+        viewer.start()
+        viewer.seek(3)
+        viewer.tick()
+        done(viewer)
+        shown = []
+        stage = viewer.halves[0].stages[1]
+        original = stage.show
+        stage.show = lambda moment: (shown.append(moment.t), original(moment))  # type: ignore[method-assign,assignment,func-returns-value]
+        viewer.choose(viewer.halves[0], 1)
+        assert set(shown) == {1}
+    finally:
+        viewer.stop()
+
+
 def test_a_screenshot_has_both_halves(pair: Viewer) -> None:
     left = join(pair, 0, Client(1))
     join(pair, 1, Client(2))
@@ -327,7 +430,18 @@ def test_the_methods_own_picture_is_behind_each_client(viewer: Viewer) -> None:
     assert client.background.shape == (1, 1, 3)  # what shows through the gaps of the background
 
 
-def test_a_path_is_recorded_played_and_saved(viewer: Viewer) -> None:
+def test_without_making_ahead_the_picture_is_as_large_as_the_window(made_up: MadeUp) -> None:
+    viewer = Viewer([made_up], send_ahead=False, on=["picture"], makes_ahead=False)
+    try:
+        client = join(viewer, 0, Client(0))
+        viewer.start()
+        assert viewer.wait_ready(30)
+        assert client.background.shape == (400, 600, 3)
+    finally:
+        viewer.stop()
+
+
+def test_a_path_is_recorded_played_and_saved(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     client = join(viewer, 0, Client(0))
     with pytest.raises(SplashbenchError, match="two key frames"):
         viewer.save_path(client, 1.0)
@@ -344,8 +458,15 @@ def test_a_path_is_recorded_played_and_saved(viewer: Viewer) -> None:
     assert len(path["camera_path"]) == 16
     assert [path["camera_path"][k]["time"] for k in (0, -1)] == pytest.approx([0.0, 0.4])
     assert path["render_width"] / path["render_height"] == pytest.approx(1.5, abs=0.01)
+    original = viewer._go
+
+    def slowly(*words: Any) -> None:
+        original(*words)
+        time.sleep(0.6)  # frames are left out, but not the last
+
+    monkeypatch.setattr(viewer, "_go", slowly)
     viewer.play_path(client, 0.5)
-    np.testing.assert_allclose(client.camera.position, [1.0, 0.5, 2.0], atol=0.1)
+    np.testing.assert_allclose(client.camera.position, [1.0, 0.5, 2.0], atol=1e-6)
     assert viewer.clock.tick() == 3
     viewer.edit_path(client, "clear")
     assert viewer.keyframes == []
@@ -381,7 +502,3 @@ def test_names_of_strangers_are_letters_in_the_panel() -> None:
 def test_white_is_behind_what_is_transparent() -> None:
     rgba = np.array([[[200, 100, 0, 0], [200, 100, 0, 255], [0, 0, 0, 128]]], np.uint8)
     assert on_white(rgba).tolist() == [[[255, 255, 255], [200, 100, 0], [127, 127, 127]]]
-
-
-def test_views_know_each_other() -> None:
-    assert View(np.ones(3), np.zeros(3), np.ones(3), 0.5).near(View(np.ones(3), np.zeros(3), np.ones(3), 0.5))

@@ -100,7 +100,7 @@ def test_other_settings_remove_what_was_made_and_what_is_under_way(scene: FakeSc
 
     def make(t: int) -> Any:
         if not scene.nodes:  # the settings change while the first is made
-            layer.settings_changed(STILL)
+            layer.settings_changed()
         return scene.add_thing(f"/{t}/{len(scene.nodes)}", visible=False)
 
     layer = TimedLayer("thing", "thing", lock, make, 2, on=True)
@@ -181,6 +181,47 @@ def test_a_large_model_is_thinned_while_it_plays_and_whole_at_rest(server: FakeS
     assert (opacities > 0).sum() == NUMBER
     layer.show(Moment(1, True))
     assert server.scene.shown() == ["/liquid/timestep 1"]
+
+
+def test_what_is_too_much_at_once_is_said(server: FakeServer, made_up: MadeUp, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splashbench.viewer.splat_layer.MOST_AT_ONCE", 20)
+    layer = splats(server, made_up, budget=4 * 10)
+    layer.set_send_ahead(True, PLAYING)
+    work(layer, PLAYING)
+    assert layer.remark == f"While it plays, 10 of up to {NUMBER} are shown; paused, at most 20."
+    rich = splats(FakeServer(), made_up, budget=4 * NUMBER)  # type: ignore[arg-type]
+    rich.set_send_ahead(True, PLAYING)
+    work(rich, PLAYING)
+    assert rich.remark.startswith(f"While it plays, 20 of up to {NUMBER} are shown")
+
+
+def test_what_is_read_while_the_worker_writes_is_locked(stage: Stage) -> None:
+    stage.layers["liquid"].set_send_ahead(True, STILL)  # type: ignore[attr-defined]
+    finish(stage)
+    reads: list[Any] = [
+        lambda: stage.layers["liquid"].loading,
+        lambda: stage.layers["liquid"].remark,
+        lambda: stage.layers["cameras"].loading,
+        lambda: stage._show_ground(True),
+    ]
+    for read in reads:
+        reader = threading.Thread(target=read)
+        with stage._lock:
+            reader.start()
+            reader.join(0.1)
+            assert reader.is_alive()
+        reader.join(10)
+        assert not reader.is_alive()
+
+
+def test_the_worker_does_not_bring_an_earlier_moment_back(stage: Stage) -> None:
+    worker = threading.Thread(target=stage.done)
+    with stage._lock:
+        worker.start()
+        worker.join(0.1)
+        stage.show(Moment(2, True))
+    worker.join(10)
+    assert stage.moment == Moment(2, True)
 
 
 def test_a_model_within_the_budget_is_whole_and_nothing_is_said(server: FakeServer, made_up: MadeUp) -> None:

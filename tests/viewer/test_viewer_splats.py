@@ -50,6 +50,25 @@ def test_what_is_too_large_for_the_format_is_cut_to_it() -> None:
     assert np.isfinite(packed.covariances.astype(np.float16)).all()
 
 
+def test_beside_a_huge_one_the_others_stay() -> None:
+    liquid = turned(200, (6e-4, 4e-4, 2e-4))
+    liquid.factors[7] = np.eye(3) * 1e4
+    exact = np.delete(liquid.covariances.astype(np.float64), 7, axis=0)
+    drawn = through_half_floats(liquid, unit_of(liquid))
+    assert np.isfinite(drawn).all()
+    size = np.abs(exact).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(np.delete(drawn, 7, axis=0) - exact) / size).max() < 1e-3
+
+
+def test_covariances_that_are_no_numbers_are_left_out() -> None:
+    broken = gaussians_of(3)
+    broken.factors[1] = np.eye(3) * 1e30  # a number, and its square is none
+    kept = sound(broken)
+    assert len(kept) == 2
+    broken.factors[1] = np.eye(3) * 1e19  # its square is one just so
+    assert np.isfinite(pack(sound(broken), 1e-6, 10).covariances.astype(np.float16)).all()
+
+
 def test_the_most_visible_are_kept_in_their_order() -> None:
     base = gaussians_of(6)
     sizes = np.array([1.0, 3.0, 1.0, 2.0, 1.0, 5.0])

@@ -25,7 +25,6 @@ from splashbench.score.image.weights import (
     WEIGHTS_SHA256,
     Weights,
     checkpoint_weights,
-    verified_weights,
     weights_digest,
     weights_path,
 )
@@ -100,12 +99,12 @@ def load_lpips(path: Path | None = None) -> tuple[Lpips | None, str]:
         return Lpips(read_npz(Path(weights_file), RANKS)), ""
     cached = _cached_file()
     if cached is not None:
-        weights = verified_weights(cached)
-        if weights is None:
+        try:
+            return Lpips(read_npz(cached, RANKS)), ""
+        except SplashbenchError:
             raise SplashbenchError(
                 f"{cached} is damaged or no file of LPIPS weights; `splashbench download lpips-weights` replaces it"
-            )
-        return Lpips(weights), ""
+            ) from None
     heads = _lpips_package_file()
     if heads is None:
         return None, f"no LPIPS weights: {_REMEDY}"

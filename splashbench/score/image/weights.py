@@ -75,12 +75,12 @@ def _load_state(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:  # its text advises to run what is in the file
-        raise SplashbenchError(f"{path} holds no plain weights; fetch it anew, or give --lpips-weights") from None
+        raise SplashbenchError(f"{path} holds no plain weights; fetch it anew") from None
     except Exception as error:  # torch lets through whatever a damaged file causes
         reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]
-        raise SplashbenchError(f"{path} cannot be read ({reason}); fetch it anew, or give --lpips-weights") from None
+        raise SplashbenchError(f"{path} cannot be read ({reason}); fetch it anew") from None
     if not isinstance(state, dict):
-        raise SplashbenchError(f"{path} holds no named weights; fetch it anew, or give --lpips-weights")
+        raise SplashbenchError(f"{path} holds no named weights; fetch it anew")
     return state
 
 
@@ -89,4 +89,4 @@ def _array(path: Path, state: dict[str, Any], name: str) -> NDArray[np.float32]:
     try:
         return np.array(state[name].numpy(), dtype=np.float32)
     except (KeyError, AttributeError, TypeError, ValueError, RuntimeError):
-        raise SplashbenchError(f"{path} lacks the weights {name}; fetch it anew, or give --lpips-weights") from None
+        raise SplashbenchError(f"{path} lacks the weights {name}; fetch it anew") from None

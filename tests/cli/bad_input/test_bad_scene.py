@@ -53,6 +53,8 @@ def giant_png(path: Path, side: int) -> None:
         ("scene.json", lambda p: edit(p, lambda d: d["times"].__setitem__(1, float("nan"))), "times must be finite"),
         ("scene.json", lambda p: edit(p, lambda d: d["times"].__setitem__(-1, 1e308)), "times must be finite"),
         ("scene.json", lambda p: edit(p, lambda d: d.update(gravity=[float("nan")] * 3)), "unit vector"),
+        ("scene.json", lambda p: edit(p, lambda d: d.update(metres_per_unit=1e-10)), "metres_per_unit"),
+        ("scene.json", lambda p: edit(p, lambda d: d.update(metres_per_unit=1e10)), "metres_per_unit"),
         ("scene.json", lambda p: edit(p, lambda d: d.update(container_pose=[[1], [1, 2]])), "must be 4x4"),
         ("scene.json", lambda p: edit(p, lambda d: d["sizes"].update({"1": [65536, 65536]})), "sizes: camera 1"),
         ("scene.json", lambda p: edit(p, lambda d: d["sizes"].update({"one": [96, 64]})), "names camera one"),
