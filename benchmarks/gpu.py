@@ -42,8 +42,8 @@ WARM_UP = 2
 
 
 def run_tests() -> dict[str, Any]:
-    """Whether the renderer's tests marked cuda pass, and pytest's last line."""
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "cuda", "tests/render"]
+    """Whether the tests marked cuda pass, the renderer's and the methods', and pytest's last line."""
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "cuda", "tests/render", "tests/methods"]
     outcome = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     lines = outcome.stdout.strip().splitlines() or [outcome.stderr.strip()[-300:]]
     # Status 0 says that none failed; tests that were skipped are not passed.

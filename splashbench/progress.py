@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterable, Iterator, Sized
 from typing import Any, TypeVar
 
+from splashbench.errors import one_line
+
 T = TypeVar("T")
 
 _LOG_INTERVAL_SECONDS = 10.0
@@ -18,6 +20,7 @@ def track(iterable: Iterable[T], description: str, total: int | None = None) -> 
     `total` is the number of items, where `iterable` has no length. Without a terminal, a line is printed every ten
     seconds instead of a bar: logs are read as lines.
     """
+    description = one_line(description)  # cameras are named by strangers' scenes
     if sys.stderr.isatty():
         from tqdm import tqdm
 
@@ -41,7 +44,7 @@ class Bar:
     """
 
     def __init__(self, description: str, keep: bool = True) -> None:
-        self._description = description
+        self._description = description = one_line(description)
         self._bar: Any = None
         self._last_line = time.monotonic()
         if sys.stderr.isatty():
@@ -51,7 +54,8 @@ class Bar:
             self._bar = tqdm(total=1.0, desc=description, file=sys.stderr, ncols=90, bar_format=form, leave=keep)
 
     def update(self, fraction: float, message: str = "") -> None:
-        """Move the bar to `fraction`, never backwards, and show `message` behind it."""
+        """Move the bar to `fraction`, never backwards, and show `message`, which may be a method's, behind it."""
+        message = one_line(message)
         if self._bar is not None:
             step = min(1.0, fraction) - self._bar.n
             self._bar.set_postfix_str(message[:40], refresh=False)

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import struct
 import zipfile
 from pathlib import Path
 
@@ -221,3 +222,58 @@ def test_the_size_of_a_folder_leaves_links_out(tmp_path: Path) -> None:
     assert tree_bytes(tmp_path) == 1024
     assert tree_bytes(tmp_path / "nowhere") == 0
     assert sha256_file(tmp_path / "file") == hashlib.sha256(bytes(24)).hexdigest()
+
+
+def _archive(path: Path, name: str, header: str, data: bytes, kind: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        text = header.encode() + b"\n"
+        archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -8)}", "states float64"),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (2, 8)}", "states float64"),
+        ("{'descr': '<f16', 'fortran_order': False, 'shape': (2, 2)}", "not numbers"),
+        ("{'descr': '<c16', 'fortran_order': False, 'shape': (2, 2)}", "not numbers"),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (2, 2)}", "without pickles"),
+        ("{'descr': '<M8[s]', 'fortran_order': False, 'shape': (2, 4)}", "not numbers"),
+        ("{'descr': '<f8'", "not a readable"),
+        ("(" * 3000, "not a readable"),
+        ("", "not a readable"),
+    ],
+)
+def test_an_array_whose_header_makes_no_sense_is_named(header: str, said: str, tmp_path: Path) -> None:
+    path = _archive(tmp_path / "a.npz", "a", header, bytes(64))
+    with pytest.raises(SplashbenchError, match=said):
+        read_npz(path, {"a": 2})
+
+
+def test_only_arrays_that_are_asked_for_are_unpacked(tmp_path: Path) -> None:
+    np.savez(path := tmp_path / "a.npz", a=np.arange(6.0).reshape(2, 3).T, b=np.array([object()]))
+    array = read_npz(path, {"a": 2}, {"c": 1})["a"]
+    np.testing.assert_array_equal(array, np.arange(6.0).reshape(2, 3).T)
+
+
+def test_a_damaged_checksum_is_found(tmp_path: Path) -> None:
+    np.savez(path := tmp_path / "a.npz", a=np.arange(1000.0))
+    content = bytearray(path.read_bytes())
+    content[3000] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(SplashbenchError, match="Bad CRC-32"):
+        read_npz(path, {"a": 1})
+
+
+def test_an_archive_of_very_many_entries_is_refused_before_they_are_listed(tmp_path: Path) -> None:
+    with zipfile.ZipFile(path := tmp_path / "a.npz", "w") as archive:
+        for n in range(1200):
+            archive.writestr(f"{n}.npy", b"")
+    with pytest.raises(SplashbenchError, match="more than 1000 arrays"):
+        read_npz(path, {"a": 1})
+    with zipfile.ZipFile(path, "w") as archive:
+        for n in range(30_000):
+            archive.writestr(f"{n:0150}", b"")
+    with pytest.raises(SplashbenchError, match="its list of entries is too long"):
+        read_npz(path, {"a": 1})

@@ -66,3 +66,16 @@ def test_a_bar_never_goes_backwards(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     captured = capsys.readouterr()
     assert "fit: 100%" in captured.err
     assert captured.out == ""
+
+
+def test_no_text_of_a_method_or_scene_takes_over_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "_LOG_INTERVAL_SECONDS", 0.0)
+    bar = progress.Bar("a\x1b[2J")
+    bar.update(0.5, "b\x1b]0;title\x07\nc")
+    list(progress.track([1, 2], "view \x1b[31m"))
+    printed = capsys.readouterr().err
+    assert "\x1b" not in printed
+    assert "\x07" not in printed
+    assert "a?[2J:  50% b?]0;title? c" in printed

@@ -13,3 +13,4 @@ class Nothing(ScaffoldGS):
     id: ClassVar[str] = "nothing"
     title: ClassVar[str] = "control: background only"
     control: ClassVar[bool] = True
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)  # what scores are compared with is the same on every machine

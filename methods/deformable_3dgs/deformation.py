@@ -17,7 +17,7 @@ OCTAVES = 10
 
 def encode(values: Tensor, octaves: int = OCTAVES) -> Tensor:
     """[N, D] to [N, D (1 + 2 octaves)]: the values, then sine and cosine of every octave in turn."""
-    angles = values[:, None] * 2.0 ** torch.arange(octaves).to(values)[:, None]
+    angles = values[:, None] * 2.0 ** torch.arange(octaves, device=values.device).to(values)[:, None]
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
     return torch.cat([values, waves.flatten(1)], dim=1)
 

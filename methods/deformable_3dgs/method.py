@@ -9,6 +9,7 @@ import numpy as np
 
 from splashbench.files import read_npz
 from splashbench.gaussians.density_control import DensityControl
+from splashbench.gaussians.devices import device_fault
 from splashbench.gaussians.fitting import fit_dynamic
 from splashbench.gaussians.initialization import camera_extent, initialization
 from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
@@ -58,6 +59,7 @@ class Deformable3DGS(Method):
     title: ClassVar[str] = "Deformable-3DGS"
     version: ClassVar[str] = "4"  # since the times' noise of `paper` is the official code's
     Config: ClassVar[type[MethodConfig]] = DeformableSettings
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     mixed: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: DeformableSettings, run: Run) -> MixedFitted:
@@ -66,6 +68,7 @@ class Deformable3DGS(Method):
             model = DeformableModel.from_start(
                 start, config.start_opacity, config.sh_degree, config.depth, config.width
             )
+            model.to(run.device)
             extent = camera_extent(scene)
             turned = ("deformation.layers",) if config.network_steps == "muon" else ()
             optimizer = RowOptimizer(model, rates(config, extent), ROWS, config.iterations, orthogonal=turned)
@@ -94,6 +97,9 @@ class Deformable3DGS(Method):
                 )
         model.deforms, model.active_degree = True, config.sh_degree
         return MixedFitted(model, scene, history)
+
+    def device_fault(self, device: str) -> str | None:
+        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         path = directory / MODEL_FILE

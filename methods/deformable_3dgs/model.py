@@ -83,7 +83,7 @@ class DeformableModel(DynamicModel):
         return DeformedGaussians(means, factors, torch.sigmoid(self.opacity_logits))
 
     def splats(self, state: DeformedGaussians, camera: Camera) -> Splats:
-        eye = torch.as_tensor(camera.center, dtype=torch.float32)
+        eye = torch.tensor(camera.center, dtype=torch.float32, device=state.means.device)
         directions = nn.functional.normalize(state.means.detach() - eye, dim=1)
         colors = harmonics.colors(self.constant, self.rest, directions, self.active_degree)
         return Splats(state.means, state.factors, state.opacities, colors)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splashbench.gaussians.dynamic_model import Splats
-from splashbench.gaussians.screen_gradients import screen_gradients
+from splashbench.gaussians.screen_gradients import screen_gradients_of
 from splashbench.scene import Camera
 
 from ..scaffold_gs.cells import LEVELS
@@ -51,14 +51,14 @@ class SpacetimeGrowth(AnchorGrowth):
     def observe(self, camera: Camera, splats: Splats, gradients: Tensor) -> None:
         assert isinstance(splats, AnchorSplats)
         assert splats.state is not None
-        state, pulls = splats.state, gradients.numpy()
-        anchors = state.anchors.numpy()
-        norms = screen_gradients(camera, splats.means.detach().numpy(), pulls)
-        weights = (state.fading * state.sigma).detach().numpy() * pulls.any(axis=1)
+        state, pulled = splats.state, gradients.any(dim=1).cpu().numpy()
+        anchors = state.anchors.cpu().numpy()
+        norms = screen_gradients_of(camera, splats.means.detach(), gradients).cpu().numpy()
+        weights = (state.fading * state.sigma).detach().cpu().numpy() * pulled
         shape = (len(anchors), self._gradient.shape[1])
         self._gradient[anchors] += (weights * norms).reshape(shape)
         self._child_visits[anchors] += weights.reshape(shape)
-        self._see_anchors(camera, state.peaks.clamp(min=0).sum(dim=1).numpy())
+        self._see_anchors(camera, state.peaks.clamp(min=0).sum(dim=1).cpu().numpy())
 
     def after_step(self, step: int) -> None:
         if self._from <= step < self._until and (step + 1 - self._from) % self._every == 0:
@@ -68,4 +68,5 @@ class SpacetimeGrowth(AnchorGrowth):
         space = torch.from_numpy(np.log(sizes).astype(np.float32))[:, None].expand(-1, 3)
         time = torch.full((len(sizes), 1), float(np.log(self.finest[3])))
         # Features come from the parent, and with them sigma times the duration: so does the duration.
-        return torch.cat([space, time, space, self.anchors.log_scales.detach()[parents, 7:]], dim=1)
+        lives = self.anchors.log_scales.detach()[parents.to(self.anchors.log_scales.device), 7:].cpu()
+        return torch.cat([space, time, space, lives], dim=1)

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from splashbench.gaussians.devices import device_fault
 from splashbench.gaussians.fitting import fit_dynamic
 from splashbench.gaussians.initialization import camera_extent, initialization
 from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
@@ -39,6 +40,7 @@ class Scaffold4D(Method):
     title: ClassVar[str] = "4D-Scaffold-GS"
     version: ClassVar[str] = "3"  # since it starts and penalises volumes as published
     Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     mixed: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: Scaffold4DSettings, run: Run) -> MixedFitted:
@@ -56,6 +58,7 @@ class Scaffold4D(Method):
                 config.spread_start,
                 1.0 if config.volume_unit == "scene" else None,
             )
+            model.to(run.device)
             optimizer = AnchorOptimizer(model, rates(config), config.iterations)
             voxel = config.voxel * float(np.median(start.spacing))
             with run.stage("fit"):
@@ -68,6 +71,9 @@ class Scaffold4D(Method):
                     after_step=lambda: run.checkpoint(lambda: MixedFitted(model, scene)),
                 )
         return MixedFitted(model, scene, history)
+
+    def device_fault(self, device: str) -> str | None:
+        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         path = directory / MODEL_FILE

@@ -208,13 +208,13 @@ class SpacetimeAnchors(Anchors, DynamicModel):
 
     def splats(self, state: AnchorInstant, camera: Camera) -> AnchorSplats:
         n, k = len(state.anchors), self.offsets.shape[1]
-        eye = torch.as_tensor(camera.center, dtype=torch.float32)
+        eye = torch.tensor(camera.center, dtype=torch.float32, device=self.device)
         directions = nn.functional.normalize(self.positions[state.anchors, :3] - eye, dim=1)
         logits = self.color_head(torch.cat([state.features, directions], dim=1)).view(n, k, 3)
         if self.base_color:
             logits = logits + state.features[:, None, :3]
         colors = torch.sigmoid(logits).view(-1, 3)
-        rows = (state.anchors[:, None] * k + torch.arange(k)).view(-1)
+        rows = (state.anchors[:, None] * k + torch.arange(k, device=self.device)).view(-1)
         return AnchorSplats(state.means, state.factors, state.opacities, colors, state.penalty, rows, state)
 
 

@@ -37,7 +37,7 @@ class Background:
 
     def __init__(self, model: AnchorModel, far_color: NDArray[np.float32]) -> None:
         # As it is stored: a saved background renders the same.
-        self.model = round_to_stored(model).eval()
+        self.model = round_to_stored(model.cpu()).eval()
         self.far_color = np.asarray(far_color, dtype=np.float32)
 
     def gaussians(self, camera: Camera) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -152,7 +152,7 @@ def fit_background(
     with one_torch_thread():
         model = fit_model(
             seed, plates, settings, far_color.astype(np.float32), run.seed,
-            lambda fraction: progress(0.1 + 0.9 * fraction, fitting), offered,
+            lambda fraction: progress(0.1 + 0.9 * fraction, fitting), offered, run.device,
         )  # fmt: skip
         return Background(supervised_anchors(model, plates), far_color)
 

@@ -81,10 +81,11 @@ def fit_model(
     random_seed: int,
     progress: Callable[[float], None],
     after_step: Callable[[AnchorModel], None] = lambda model: None,
+    device: str = "cpu",
 ) -> AnchorModel:
     """Optimise a model that starts at `seed`; `progress` hears the fraction done. `plates` show something each.
 
-    after_step: hears the model as it is after every step.
+    after_step: hears the model as it is after every step. device: where the model is fitted, and returned.
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -92,13 +93,13 @@ def fit_model(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(random_seed)
         variant = StaticAnchorSpec(settings.children, settings.view_dependent_shape, settings.base_color)
-        model = AnchorModel.from_seed(seed, variant, settings.spread_start)
+        model = AnchorModel.from_seed(seed, variant, settings.spread_start).to(device)
         optimizer = AnchorOptimizer(model, settings.rates, settings.iterations, settings.rates_until)
         growth = Growth(optimizer, seed.voxel, settings, rng)
         shares = (settings.count_from, settings.grow_from, settings.grow_until)
         count_from, grow_from, grow_until = (round(share * settings.iterations) for share in shares)
         unit = float(np.median(seed.spacing)) if settings.volume_unit == "spacing" else 1.0
-        behind = torch.as_tensor(far_color)
+        behind = torch.as_tensor(far_color).to(device)
         longest = max(max(plate.camera.width, plate.camera.height) for plate in plates)
         sizes = pyramid(longest, settings.coarse_side, settings.iterations)
         for iteration in range(settings.iterations):
@@ -142,17 +143,18 @@ def supervised_anchors(model: AnchorModel, plates: list[CleanPlate]) -> AnchorMo
     training images). The weight of a Gaussian in a set of pixels is the gradient of their summed colour with respect to
     its own colour.
     """
-    weight = torch.zeros(len(model))
+    device = model.positions.device
+    weight = torch.zeros(len(model), device=device)
     for plate in plates:
         with torch.no_grad():
             means, factors, opacities, colors, _ = model.decode(plate.camera.center)
         color = torch.zeros_like(colors[:, :1]).requires_grad_()
         image, _ = rasterize(means, factors, opacities, color, plate.camera)
-        image[..., 0][torch.as_tensor(plate.seen)].sum().backward()
+        image[..., 0][torch.as_tensor(plate.seen).to(device)].sum().backward()
         assert color.grad is not None
         weight += color.grad.view(len(model), -1).sum(dim=1)
     keep = torch.nonzero(weight >= _MIN_PIXELS)[:, 0]
-    supervised = AnchorModel(len(keep), model.variant)
+    supervised = AnchorModel(len(keep), model.variant).to(device)
     rows = {"positions", *PER_ANCHOR}
     supervised.load_state_dict({name: t[keep] if name in rows else t for name, t in model.state_dict().items()})
     return supervised

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splashbench.gaussians.screen_gradients import screen_gradients
+from splashbench.gaussians.screen_gradients import screen_gradients_of
 from splashbench.scene import Camera
 
 from .cells import LEVELS, GrowthLevel, NewCells, new_cells
@@ -70,7 +70,7 @@ class AnchorGrowth(ABC):
 
     def _see_anchors(self, camera: Camera, opacities: NDArray[np.float32]) -> None:
         """Count a visit of every anchor within the image, with its children's summed `opacities` [N]."""
-        uv, depth = camera.project(self.anchors.positions[:, :3].numpy())
+        uv, depth = camera.project(self.anchors.positions[:, :3].cpu().numpy())
         inside = (depth > 0) & (uv > 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
         self._opacity[inside] += opacities[inside]
         self._visits += inside
@@ -91,7 +91,7 @@ class AnchorGrowth(ABC):
         k, dimensions = self.anchors.offsets.shape[1:]
         n, parents = len(cells.centers), torch.from_numpy(cells.chosen // k)
         new = {
-            "features": self.anchors.features.detach()[parents],
+            "features": self.anchors.features.detach()[parents.to(self.anchors.features.device)],
             "offsets": first_offsets(n, k, dimensions, self.rules.spread),
             "log_scales": self._log_scales(parents, cells.sizes),
         }
@@ -118,9 +118,9 @@ class AnchorGrowth(ABC):
         model, dimensions = self.anchors, len(self.finest)
         children = model.positions[:, None] + model.offsets * torch.exp(model.log_scales[:, None, :dimensions])
         return new_cells(
-            children.reshape(-1, dimensions).numpy().astype(np.float64),
+            children.reshape(-1, dimensions).cpu().numpy().astype(np.float64),
             mean,
-            model.positions.numpy().astype(np.float64),
+            model.positions.cpu().numpy().astype(np.float64),
             self.finest,
             self.levels,
             self.rules.gradient,
@@ -153,12 +153,12 @@ class Growth(AnchorGrowth):
     def observe(self, camera: Camera, gaussians: DecodedGaussians) -> None:
         """Take note of a step; `gaussians.means` has kept the gradient of its loss."""
         assert gaussians.means.grad is not None
-        gradients = gaussians.means.grad.numpy()
-        norms = screen_gradients(camera, gaussians.means.detach().numpy(), gradients)
+        gradients = gaussians.means.grad
+        norms = screen_gradients_of(camera, gaussians.means.detach(), gradients).cpu().numpy()
         self._gradient += norms.reshape(self._gradient.shape)
-        self._child_visits += gradients.any(axis=1).reshape(self._child_visits.shape)
+        self._child_visits += gradients.any(dim=1).cpu().numpy().reshape(self._child_visits.shape)
         total = gaussians.opacities.detach().clamp(min=0).view(self._gradient.shape).sum(dim=1)
-        self._see_anchors(camera, total.numpy())
+        self._see_anchors(camera, total.cpu().numpy())
 
     def _log_scales(self, parents: torch.Tensor, sizes: NDArray[np.float64]) -> torch.Tensor:
         return torch.from_numpy(np.log(sizes).astype(np.float32))[:, None].expand(-1, 6)

@@ -116,7 +116,8 @@ class AnchorModel(Anchors):
 
     def _inputs(self, eye: NDArray) -> tuple[torch.Tensor, torch.Tensor]:
         """What the colour head reads, and what the opacity and shape heads read: [N, FEATURES + 3] each."""
-        direction = nn.functional.normalize(self.positions - torch.as_tensor(eye, dtype=torch.float32), dim=1)
+        eye_at = torch.tensor(eye, dtype=torch.float32, device=self.positions.device)
+        direction = nn.functional.normalize(self.positions - eye_at, dim=1)
         seen = torch.cat([self.features, direction], dim=1)
         if self.variant.view_dependent_shape:
             return seen, seen

@@ -57,5 +57,7 @@ class AnchorOptimizer(RowOptimizer):
 
         Kept rows keep their moments; new ones start without any.
         """
-        self.model.positions = torch.cat([self.model.positions[torch.from_numpy(kept)], positions])
+        device = self.model.positions.device
+        kept_positions = self.model.positions[torch.from_numpy(kept).to(device)]
+        self.model.positions = torch.cat([kept_positions, positions.to(device)])
         self.replace_rows(kept, new)

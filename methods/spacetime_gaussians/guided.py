@@ -71,12 +71,12 @@ class GuidedDensity:
         for photograph in looked_at:
             camera = photograph.camera
             splats = self._model.splats(self._model.at(photograph.time), camera)
-            image = self._model.view(splats, camera, photograph.time).numpy()
+            image = self._model.view(splats, camera, photograph.time).cpu().numpy()
             error = np.abs(image - photograph.image * np.float32(1 / 255)).mean(axis=2)
             if best is None or error.mean() > best[0]:
-                pixels, depth = camera.project(splats.means.numpy())
+                pixels, depth = camera.project(splats.means.cpu().numpy())
                 inside = (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
-                shown = depth[(depth > 0) & inside & (splats.opacities.numpy() > 0.05)].astype(np.float32)
+                shown = depth[(depth > 0) & inside & (splats.opacities.cpu().numpy() > 0.05)].astype(np.float32)
                 best = float(error.mean()), photograph, error, shown
         assert best is not None
         return best[1], best[2], best[3]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from splashbench.gaussians.density_control import DensityControl
+from splashbench.gaussians.devices import device_fault
 from splashbench.gaussians.fitting import fit_dynamic
 from splashbench.gaussians.initialization import camera_extent, initialization
 from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
@@ -56,6 +57,7 @@ class SpacetimeGaussians(Method):
     title: ClassVar[str] = "SpacetimeGaussians, full"
     version: ClassVar[str] = "3"  # since `quick` starts with faint Gaussians, as published
     Config: ClassVar[type[MethodConfig]] = SpacetimeSettings
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     mixed: ClassVar[bool] = True
     full: ClassVar[bool] = True
 
@@ -63,6 +65,7 @@ class SpacetimeGaussians(Method):
         with initialization(scene, config, run) as (start, rng):
             times = np.array([unit_time(scene, float(seconds)) for seconds in scene.times])
             model = SpacetimeModel.from_start(start, self.full, config.start_opacity, config.hull_log_width, times)
+            model.to(run.device)
             extent = camera_extent(scene)
             optimizer = RowOptimizer(model, rates(config, extent, self.full), model.rows, config.iterations)
             photographs = Photographs(scene, config.longest_side, config.views_per_step, rng)
@@ -78,6 +81,9 @@ class SpacetimeGaussians(Method):
                     after_step=lambda: run.checkpoint(lambda: MixedFitted(model, scene)),
                 )
         return MixedFitted(model, scene, history)
+
+    def device_fault(self, device: str) -> str | None:
+        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         model = SpacetimeModel(0, self.full)
@@ -95,4 +101,4 @@ class SpacetimeGaussiansLite(SpacetimeGaussians):
 
 def _anywhere(rows: dict[str, Tensor]) -> None:
     """Gaussians made from others get a time anywhere in the recording."""
-    rows["times"] = torch.rand_like(rows["times"])
+    rows["times"] = torch.rand(rows["times"].shape).to(rows["times"])

@@ -126,12 +126,12 @@ class SpacetimeModel(DynamicModel):
         if not self.full:
             return backdrop
         # With the features at nought the decoder leaves the logits as they are. .001 is a quarter of a grey level.
-        return torch.cat([torch.logit(backdrop.clamp(0.001, 0.999)), torch.zeros(6)])
+        return torch.cat([torch.logit(backdrop.clamp(0.001, 0.999)), backdrop.new_zeros(6)])
 
     def decoded(self, rendered: Tensor, camera: Camera) -> Tensor:
         """Logits [H, W, 3] of the full model's channels [H, W, 9]."""
         base, features, timed = rendered.split(3, dim=2)
-        return base + self.decoder(torch.cat([features, timed, torch.from_numpy(rays(camera))], dim=2))
+        return base + self.decoder(torch.cat([features, timed, rays_on(camera, rendered.device)], dim=2))
 
 
 def _opacities(logits: Tensor, since: Tensor, log_widths: Tensor) -> Tensor:
@@ -156,3 +156,21 @@ def rays(camera: Camera) -> np.ndarray:
     table[..., :3] = camera.center
     np.divide(directions, lengths, out=table[..., 3:], casting="same_kind")
     return table
+
+
+def rays_on(camera: Camera, device: torch.device) -> Tensor:
+    """`rays` on `device`; worked out there unless it is the CPU, since a step's images would wait for them."""
+    return torch.from_numpy(rays(camera)) if device.type == "cpu" else _rays_by_torch(camera, device)
+
+
+def _rays_by_torch(camera: Camera, device: torch.device) -> Tensor:
+    w2c, center = (torch.tensor(a, dtype=torch.float32, device=device) for a in (camera.w2c, camera.center))
+    right, down, forward = w2c[:3, :3]
+    columns, lines = (torch.arange(n, device=device) + 0.5 for n in (camera.width, camera.height))
+    u, v = (
+        (columns - float(camera.K[0, 2])) / float(camera.K[0, 0]),
+        (lines - float(camera.K[1, 2])) / float(camera.K[1, 1]),
+    )
+    directions = (v[:, None] * down + forward)[:, None] + u[None, :, None] * right
+    directions = directions / torch.sqrt(v.square()[:, None] + u.square() + 1)[..., None]
+    return torch.cat([center.expand_as(directions), directions], dim=2)

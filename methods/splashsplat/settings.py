@@ -47,6 +47,7 @@ class SplashSplatConfig(MethodConfig):
     """Settings of SplashSplat. Lengths are in transport voxels; *_cells counts cells along the longest side."""
 
     # Observation fields
+    #: cells of the visual hull's grid, at most
     hull_cells: int = Field(300, ge=16, le=512)
     #: edge of a hull voxel in pixels of the photographs, at the least: grids have fewer cells than `hull_cells`,
     #: `transport_cells` and `control_cells` where that many do; 0 for as many always
@@ -58,7 +59,9 @@ class SplashSplatConfig(MethodConfig):
     observable: bool = False
     #: hull cells along the longest side that `voxel_pixels` and `clear_voxel_pixels` leave at least
     fewest_cells: int = Field(128, ge=16, le=512)
+    #: cells of the grid of motion and carriers, at most
     transport_cells: int = Field(150, ge=16, le=256)
+    #: cells of the grid that the velocity is fitted on, at most
     control_cells: int = Field(38, ge=4, le=128)
     #: control cells are "cubes", `control_cells` of them along the longest side, or along every one of the "sides" of
     #: the box, as the paper's 24^3
@@ -91,27 +94,39 @@ class SplashSplatConfig(MethodConfig):
     ballistic: bool = True
     #: no motion where the level set's leads farther away from the observations than none
     gate_motion: bool = True
+    #: steps of the velocity's fit between two frames; 0 for no motion
     velocity_steps: int = Field(15, ge=0)
     #: the fit of a step starts from the motion of the one before, not from none
     velocity_carry_on: bool = True
+    #: share of the Gauss-Newton displacement that a step takes
     velocity_step_size: PositiveFloat = 0.45
+    #: how far from the surface the velocity is fitted, in transport voxels
     velocity_band: PositiveFloat = 4.0
+    #: width of the Gaussian that smooths the velocity; 0 for none
     velocity_smoothing: float = Field(0.6, ge=0)
+    #: what is smoothed: each step's "update", or the whole "field" as in the paper
     velocity_smooth: Literal["update", "field"] = "update"
     #: voxels of which grid `velocity_smoothing` is in: the "control" grid's cells, or "transport" voxels
     velocity_smoothing_unit: Literal["control", "transport"] = "control"
+    #: share of its divergence-free projection that the velocity takes on
     projection_blend: float = Field(0.35, ge=0, le=1)
+    #: no velocity is beyond this, in transport voxels per frame
     velocity_limit: PositiveFloat = 8.0
     # Carriers
     #: "full", or one of the paper's ablations "no_resampling", "per_frame" and "flip"; the last needs gravity, the
     #: metric scale and the frames' times in scene.json
     variant: TrackingVariant = "full"
+    #: how far, at most, a carrier outside the hull is moved towards it, in transport voxels
     correction: PositiveFloat = 1.0
+    #: carriers farther outside the surface than this are dropped
     kill_outside: PositiveFloat = 0.5
+    #: carriers deeper than this, which is negative, are dropped; None for none
     kill_inside: float | None = Field(-16.0, lt=0)
+    #: carriers of a cell, at most, the oldest ones; None for no limit
     cell_capacity: PositiveInt | None = 8
     #: frames that a carrier lasts on average; None for as long as it stays in the liquid
     lifetime: PositiveInt | None = 4
+    #: how far below the surface carriers are born
     shell_depth: PositiveFloat = 12.0
     #: no more than this in a transparent container: views see the liquid's sides there, and its surface is not deep in
     #: the hull; as much less far are carriers seen through liquid
@@ -120,13 +135,16 @@ class SplashSplatConfig(MethodConfig):
     shell_outside: float = Field(0, ge=0, le=0.5)
     #: how far from the surface a carrier is born for a pixel of a mask that no liquid covers; 0 for none
     coverage_reach: float = Field(4.0, ge=0)
+    #: carriers that a cell is filled up to, at the least
     min_per_cell: PositiveInt = 2
+    #: and at the most, near the surface and where it is curved
     max_per_cell: PositiveInt = 6
     #: of cells deeper than 3 voxels; None for as many as elsewhere
     interior_per_cell: PositiveInt | None = 1
     #: no carriers where no training view can see them
     visible_only: bool = True
     # Decoder
+    #: learned features of a carrier
     feature_size: PositiveInt = 16
     #: hidden units of the colour head
     color_width: PositiveInt = 32
@@ -143,22 +161,30 @@ class SplashSplatConfig(MethodConfig):
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
+    #: steps of the appearance's fit, at most
     iterations: int = Field(4000, ge=0)
+    #: of carriers' own features
     learning_rate_features: PositiveFloat = 0.06
+    #: of the features that carriers of a cell share
     learning_rate_cells: PositiveFloat = 0.02
+    #: of the decoder's heads
     learning_rate_heads: PositiveFloat = 0.015
+    #: of carriers' sizes
     learning_rate_scales: PositiveFloat = 1e-2
     #: carriers born in one cell share a part of their features: its size in voxels and in frames, for each part
     feature_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
     #: and one with all carriers ever born in a cell of so many voxels; 0 for none
     still_cell: float = Field(2.0, ge=0)
+    #: learning rates fall along a half cosine, where the schedule is fixed
     anneal: bool = True
     #: share of the photographs by whose loss the fit stops before `iterations`, and which it leaves out; 0 never stops
     validation_share: float = Field(0.0, ge=0, le=0.1)
+    #: gain in withheld photographs below which learning rates fall and the fit ends; see `validation_share`
     stop_gain: float = Field(0.01, ge=0, lt=1)
     #: PSNR of withheld photographs, in dB, that iterations have to gain for each doubling of the time, so that there
     #: are more of them; 0 for `stop_gain`
     price: float = Field(0.0, ge=0, le=10)
+    #: the SSIM term enters every so many iterations, weighted up by as much
     ssim_every: PositiveInt = 1
     #: what the silhouette term is averaged over: the "image", the "window" around all masks of the view, or the "mask"
     silhouette_norm: SilhouetteNorm = "window"
@@ -166,12 +192,19 @@ class SplashSplatConfig(MethodConfig):
     between_frames: BetweenFrames = "both"
     #: the liquid is drawn "over" an image of the background, or "together" with the background's Gaussians, by depth
     composition: Composition = "over"
+    #: weight of the loss: colours within the mask
     foreground_weight: float = Field(0.5, ge=0)
+    #: weight of the loss: image gradients within the mask
     gradient_weight: float = Field(0.1, ge=0)
+    #: weight of the loss: SSIM
     ssim_weight: float = Field(0.2, ge=0)
+    #: weight of the loss: opacity against the mask
     silhouette_weight: float = Field(0.4, ge=0)
+    #: weight of the loss: sizes of Gaussians, the mean trace of their covariances
     covariance_weight: float = Field(0.01, ge=0)
+    #: weight of the loss: children of a carrier apart from one another
     separation_weight: float = Field(0.1, ge=0)
+    #: weight of the loss: colours of a cell's carriers apart from their mean
     color_weight: float = Field(1.0, ge=0)
     #: of what photographs show beside the liquid, where there is `glass`
     beside_weight: float = Field(0.4, ge=0)
@@ -198,6 +231,7 @@ class SplashSplatConfig(MethodConfig):
     #: stores in steps of a twentieth of each value's spread
     storage_tolerance: float = Field(0.05, ge=0, le=1)
     # Background, fitted by scaffold_gs: its preset
+    #: preset of scaffold_gs, by which the background is fitted
     background_preset: Literal["best", "paper", "brief", "quick"] = "brief"
     #: hull cells, at the most, of a draft that is made first where states of the fit are taken (`run --checkpoints`);
     #: 0 for none

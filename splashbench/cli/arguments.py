@@ -81,9 +81,14 @@ def add_seeds(parser: argparse._ActionsContainer, help: str) -> None:
     )
 
 
-def add_device(parser: argparse._ActionsContainer) -> None:
-    """Add `--device`."""
-    parser.add_argument("--device", default="cpu", help="cpu (default), or cuda for methods that can use it")
+def add_device(parser: argparse._ActionsContainer, automatic: bool = False) -> None:
+    """Add `--device`; automatic: whether a GPU is taken where there is one and the method can use it."""
+    default = "a GPU with gsplat where there is one and the method can use it" if automatic else "cpu"
+    parser.add_argument(
+        "--device",
+        default="auto" if automatic else "cpu",
+        help=f"cpu, or cuda for methods that can (default: {default})",
+    )
 
 
 def add_timeout(parser: argparse._ActionsContainer, help: str) -> None:
@@ -160,9 +165,6 @@ def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) ->
         help=f"for each fit, and again for each rendering; a run that takes longer {lost}",
     )
     parser.add_argument(
-        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
-    )
-    parser.add_argument(
         "--budget",
         type=positive_number("minutes"),
         metavar="MINUTES",
@@ -172,10 +174,10 @@ def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) ->
     parser.add_argument("--retry", action="store_true", help="repeat failed runs")
 
 
-def add_run_options(parser: argparse._ActionsContainer) -> None:
-    """Add what `run` and `run-external` have in common."""
+def add_run_options(parser: argparse._ActionsContainer, automatic_device: bool = False) -> None:
+    """Add what `run` and `run-external` have in common; automatic_device: see `add_device`."""
     add_seed(parser)
-    add_device(parser)
+    add_device(parser, automatic_device)
     add_timeout(parser, "limit for the fit, and again for the rendering")
     parser.add_argument(
         "--timing-frames",

@@ -9,8 +9,11 @@ from splashbench.cli.command import add_command
 from splashbench.cli.output import report_faults, say
 
 _EPILOG = """\
-example:
+examples:
   splashbench check submissions/bowl_001/splashsplat --scene scenes/bowl_001
+  splashbench check submissions/bowl_001/from_elsewhere --scene scenes/bowl_001 --pixels
+
+Images are held against their checksums. Only one that was forged on purpose needs --pixels to be found.
 """
 
 
@@ -21,11 +24,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         "check",
         run,
         summary="list every fault of a submission",
-        description="List every fault of SUBMISSION: changed or missing files, wrong sizes, missing frames.",
+        description="List every fault of SUBMISSION: changed or missing files, wrong sizes or formats, missing frames.",
         epilog=_EPILOG,
     )
     parser.add_argument("submission", type=Path, metavar="SUBMISSION", help="folder of the submission")
     parser.add_argument("--scene", type=Path, help="the scene it was made for: sizes and frames are checked against it")
+    parser.add_argument("--pixels", action="store_true", help="also unpack every image, as scoring does; slower")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.submission import Status, Submission, check_submission
 
     scene = Scene.open(arguments.scene) if arguments.scene else None
-    faults = check_submission(arguments.submission, scene)
+    faults = check_submission(arguments.submission, scene, arguments.pixels)
     if not faults:
         # Complete, but nothing to score: a person who checks wants to know.
         record = Submission.open(arguments.submission, verify=False).record

@@ -28,7 +28,7 @@ from splashbench.version import __version__
 #: In the order of the work: session, scene, method, submission, result.
 COMMANDS = (
     *("demo", "synth", "prepare", "masks", "scene", "methods", "run", "run-external", "check", "explain"),
-    *("view", "video", "restyle", "export", "download", "score", "leaderboard", "study"),
+    *("view", "video", "restyle", "export", "download", "score", "leaderboard", "study", "benchmark"),
 )
 
 _EPILOG = """\
@@ -45,6 +45,8 @@ the usual order:
   splashbench score SUBMISSION --scene SCENE --out RESULTS
   splashbench leaderboard RESULTS OUT               CSV, table and charts
   splashbench study run ablation OUT --scenes SCENE     many runs in one table
+  splashbench download scenes REAL                  the paper's 20 real scenes
+  splashbench benchmark run OUT --scenes REAL       methods on all of them, with an estimate before
 """
 
 

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from splashbench.errors import one_line
+
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add the `--json` flag."""
@@ -31,7 +33,7 @@ def report_faults(noun: str, place: Path, faults: Sequence[str], as_json: bool) 
     if as_json:
         emit({noun: str(place), "ok": not faults, "faults": list(faults)})
     for fault in faults:
-        say(f"error: {fault}")
+        say(f"error: {one_line(fault)}")
     if not faults:
         say(f"{place}: no fault found")
     return 1 if faults else 0

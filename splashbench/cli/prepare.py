@@ -17,12 +17,12 @@ examples:
   splashbench prepare sessions/monday scenes/monday --masks sam3_masks --interval 12.4 17.7 --replace
   splashbench prepare sessions/monday scenes/monday --from masks --replace      the masks and the scene once more
 
-SESSION holds session.toml and the cameras' own files. Each camera has three clips: the ChArUco board; the textured
+SESSION holds session.toml and the cameras' own files. Each camera has three clips: the board; the textured
 static scene with the board flat on the table; the pour, with sound. A handheld sweep shows the static scene.
 SCENE is written only where every essential gate passes. Its prepare_report.html shows every stage's outcome.
 
-With --init, leave SCENE out; --replace is then for session.toml. It does not look for folders of photographs: add them
-to session.toml by hand.
+With --init, leave SCENE out; --replace is then for session.toml. It recognises ChArUco boards and checkerboards, and
+takes folders of photographs for the board, the static scene and the sweep.
 
 Results of each stage are cached in SESSION/prepare. The next run repeats only what has changed, and continues a run
 that was stopped. Stages, in order: sync, motion, intrinsics, poses, metric, container, masks, scene.
@@ -112,13 +112,13 @@ def _describe(arguments: argparse.Namespace) -> int:
 
     description = describe(arguments.session, arguments.square_metres, arguments.replace)
     rows = [
-        [video.camera or "-", video.subject or "not used", str(len(video.files)), video.files[0]]
+        [video.camera or "none", video.subject or "not used", str(len(video.files)), video.files[0]]
         for video in description.recordings
     ]
     say(table(["camera", "shows", "files", "first file"], rows))
     if description.board is not None:
         board = description.board
-        say(f"board: {board.squares_x}x{board.squares_y} squares, {board.dictionary}")
+        say(f"board: {board.squares_x}x{board.squares_y} squares, {board.dictionary or board.kind}")
     for line in description.to_do:
         say(f"to do: {line}")
     say(f"wrote {description.path}; check it, then run: splashbench prepare {arguments.session} SCENE")
@@ -176,7 +176,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     say(table(["gate", "value", "limit", "outcome"], rows))
     for gate in preparation.warnings:
-        say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}")
+        say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}; {gate.remedy}")
     seconds_spent = {name: record.spent for name, record in preparation.stages.items() if not record.reused}
     reused = [name for name, record in preparation.stages.items() if record.reused]
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in seconds_spent.items())
@@ -193,4 +193,4 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _figure(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+    return "unknown" if value is None else f"{value:.4g}"

@@ -59,7 +59,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         help="also keep the views of the fit on its way, after about 5, 7, 10, 14, 20 ... seconds of it",
     )
     _add_budgets(parser)
-    add_run_options(parser)
+    add_run_options(parser, automatic_device=True)
 
 
 def _add_budgets(parser: argparse.ArgumentParser) -> None:
@@ -123,6 +123,7 @@ def run(arguments: argparse.Namespace) -> int:
         keep_model=not arguments.no_model,
         replace=arguments.replace,
         oracle_geometry=_oracle_geometry,
+        tell=say,
     )
     return report_submission(submission, arguments)
 

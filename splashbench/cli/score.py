@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from splashbench.cli.arguments import add_lpips_weights, add_settings
 from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, say, table
+from splashbench.cli.verification import verify_results, without_need_of
 
 if TYPE_CHECKING:
     from splashbench.score import Protocol, Result
@@ -19,6 +20,7 @@ _EPILOG = """\
 examples:
   splashbench score runs/bowl_001/splashsplat --scene scenes/bowl_001 --out results
   splashbench score runs/bowl_001/* --scene scenes/bowl_001 --out results --reference runs/bowl_001/nothing
+  splashbench score --verify results/*.json --scene scenes/bowl_001 --submissions runs    do these results hold?
 
 Beside each result lie its pictures (.jpg), which the leaderboard's page shows. A run with checkpoints has them scored.
 Ground truth comes from SCENE alone. A failed run becomes a result with its status and without scores. --reference
@@ -26,6 +28,7 @@ takes the submission of the control `nothing` on the same scene and gives dpsnr_
 else it is null: `splashbench download lpips-weights` fetches them once. Before those come --lpips-weights and the
 environment variable SPLASHBENCH_LPIPS_WEIGHTS, after them an installed lpips package with torchvision's AlexNet cached.
 Where a synthetic SCENE has true particles, geometry and motion are compared with them.
+With --verify the arguments are results: their submissions, beside them or in --submissions, are scored again.
 """
 
 # Columns of the printed table; a result has every metric. Those against true particles have a table of their own.
@@ -44,7 +47,23 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("submissions", nargs="+", type=Path, metavar="SUBMISSION", help="folder of a submission")
     parser.add_argument("--scene", type=Path, required=True, help="folder of the scene the submissions are of")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder the results are written into")
+    out = parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder the results are written into"
+    )
+    parser.add_argument(
+        "--verify",
+        action=without_need_of(out),
+        help="verify results (.json) in the place of submissions; nothing is written",
+    )
+    parser.add_argument(
+        "--submissions",
+        dest="look_in",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FOLDER",
+        help="with --verify: where submissions are, besides the results' own folder",
+    )
     parser.add_argument("--reference", type=Path, metavar="SUBMISSION", help="the control `nothing` on this scene")
     add_lpips_weights(parser)
     parser.add_argument("--sheet", type=Path, metavar="PNG", help="also draw a contact sheet of all submissions")
@@ -59,6 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.score import score_submission, shared_fields
     from splashbench.submission import Submission, require_outside
 
+    if arguments.verify:
+        return verify_results(arguments)
     protocol = _protocol(arguments.changes)
     sealed = [*arguments.submissions, *([arguments.reference] if arguments.reference else [])]
     require_folder_place(arguments.out)

@@ -20,12 +20,14 @@ from splashbench.cli.arguments import (
 )
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say
+from splashbench.cli.study_machines import add_machines, machine_options
 
 _EPILOG = """\
 examples:
   splashbench study run ablation OUT --scenes scenes/bowl_001 scenes/bowl_002
   splashbench study run masks OUT --scenes SCENE --seeds 0 1 2 --set iterations=300
   splashbench study run my_study.toml OUT --jobs 2
+  splashbench study run my_study.toml OUT --on ray --cores 2    on all machines of a Ray cluster
   splashbench study run ablation OUT --scenes SCENE --only per_frame      one row; the others stay as they are
 
 SPEC is a TOML file, or one of: ablation, baselines, best, interpolation, masks, sensitivity, views
@@ -38,6 +40,7 @@ examples:
   splashbench study stress OUT --methods splashsplat:quick spacetime_gaussians --scenes scenes/bowl_001
   splashbench study stress OUT --methods my.py:Mine --scenes SCENE --severities 1 3 5 --kinds pose_rotation exposure
   splashbench study stress OUT --methods splashsplat --scenes SCENE --seeds 0 1 2 --jobs 2
+  splashbench study stress OUT --methods splashsplat --scenes SCENE --on ray://head:6379 --memory 8
   splashbench study stress OUT --methods splashsplat --scenes DENSE --every 4     clocks off by part of a timestep
 
 Training views alone are made worse; test views stay. OUT gets stability.md with a chart, and stability.csv,
@@ -75,12 +78,10 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     add_seeds(parser, "in place of the spec's")
     add_settings(parser, "a setting of every row, such as the number of iterations; overrides the spec's", dest="base")
     parser.add_argument("--only", nargs="+", action="extend", metavar="VARIANT", help="run these variants only")
-    parser.add_argument(
-        "--jobs", type=whole_number(1), default=1, metavar="N", help="runs at the same time (default: 1)"
-    )
     parser.add_argument("--retry", action="store_true", help="repeat failed runs")
     parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
     add_lpips_weights(parser)
+    add_machines(parser)
 
     _register_stress(actions)
     study_capacity.register(actions)
@@ -137,6 +138,7 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
     )
     add_study_runs(parser, "keeps nothing", "those first that say the most about where methods break")
     add_lpips_weights(parser)
+    add_machines(parser)
 
 
 def stress(arguments: argparse.Namespace) -> int:
@@ -173,7 +175,11 @@ def stress(arguments: argparse.Namespace) -> int:
         f"{len(planned.plan.scenes)} scenes, {len(planned.plan.spec.seeds)} seeds"
     )
     options = ExecutionOptions(
-        jobs=arguments.jobs, retry=arguments.retry, lpips_weights=arguments.lpips_weights, tell=say, pictures=True
+        **machine_options(arguments),
+        retry=arguments.retry,
+        lpips_weights=arguments.lpips_weights,
+        tell=say,
+        pictures=True,
     )
     if arguments.budget:
         options.order = by_uncertainty(planned, store, Budget(60 * arguments.budget))
@@ -223,7 +229,7 @@ def run(arguments: argparse.Namespace) -> int:
     plan = make_plan(spec)
     options = ExecutionOptions(
         only=tuple(arguments.only) if arguments.only else None,
-        jobs=arguments.jobs,
+        **machine_options(arguments),
         keep=arguments.keep,
         retry=arguments.retry,
         lpips_weights=arguments.lpips_weights,

@@ -15,6 +15,7 @@ from splashbench.cli.arguments import (
 )
 from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, say
+from splashbench.cli.study_machines import add_machines, machine_options
 
 _EPILOG = """\
 examples:
@@ -22,6 +23,7 @@ examples:
   splashbench study capacity spacetime_gaussians OUT --scenes SCENE --preset quick --ladder iterations=500,1000,2000
   splashbench study capacity my.py:Mine OUT --scenes SCENE --ladder points=1000,4000,16000 --ladder cells=32,64,128
   splashbench study capacity splashsplat OUT --scenes A B --seeds 0 1 --budget 120
+  splashbench study capacity splashsplat OUT --scenes A B --on ray --cores 4
 
 Several --ladder are climbed together, and need as many values each. OUT gets capacity.md with a chart, and
 capacity.csv with a row per rung, scene and seed. Some training views are scored besides: where they rise while test
@@ -59,6 +61,7 @@ def register(actions: argparse._SubParsersAction) -> None:
     add_seeds(parser, "of the method (default: 0)")
     add_study_runs(parser, "has no figures", "the smallest rungs first")
     add_lpips_weights(parser)
+    add_machines(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -85,7 +88,11 @@ def run(arguments: argparse.Namespace) -> int:
         f"{len(plan.spec.seeds)} seeds"
     )
     options = ExecutionOptions(
-        jobs=arguments.jobs, retry=arguments.retry, lpips_weights=arguments.lpips_weights, tell=say, training=True
+        **machine_options(arguments),
+        retry=arguments.retry,
+        lpips_weights=arguments.lpips_weights,
+        tell=say,
+        training=True,
     )
     if arguments.budget:
         options.order = smallest_first(capacity, store, Budget(60 * arguments.budget))

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from email.message import Message
 from http import HTTPStatus
+from http.cookiejar import CookieJar
 from typing import IO, Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
@@ -24,6 +25,7 @@ from splashbench.version import __version__
 
 _BLOCK_BYTES = 1 << 18
 _LONGEST_WAIT_SECONDS = 60.0
+_PAGES = ("text/html", "application/xhtml+xml")
 # Of the statuses below 500 these may pass (RFC 9110, RFC 6585, RFC 8470).
 _PASSING = (HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS)
 
@@ -56,6 +58,16 @@ class Answer:
     total: int | None
     response: http.client.HTTPResponse
 
+    @property
+    def is_page(self) -> bool:
+        """Whether the server says that this is a web page."""
+        return self.response.headers.get_content_type() in _PAGES
+
+    @property
+    def url(self) -> str:
+        """The address that answered in the end, after all redirects."""
+        return self.response.url
+
     def blocks(self) -> Iterator[bytes]:
         """The bytes as they arrive. Raises LostError where the connection breaks; a short answer just ends."""
         while True:
@@ -69,8 +81,10 @@ class Answer:
 
 
 @contextmanager
-def ask(url: str, offset: int, timeout_seconds: float) -> Iterator[Answer]:
+def ask(url: str, offset: int, timeout_seconds: float, cookies: CookieJar | None = None) -> Iterator[Answer]:
     """Ask for the bytes of `url` from `offset` on; the server may answer with the whole file.
+
+    cookies: those of earlier answers, which this one may add to; none are sent or taken where there is no jar.
 
     Raises RefusedError, LostError or OutOfRangeError.
     """
@@ -78,7 +92,7 @@ def ask(url: str, offset: int, timeout_seconds: float) -> Iterator[Answer]:
     if offset:
         headers["Range"] = f"bytes={offset}-"
     try:
-        response = _opener().open(urllib.request.Request(url, headers=headers), timeout=timeout_seconds)
+        response = _opener(cookies).open(urllib.request.Request(url, headers=headers), timeout=timeout_seconds)
     except HTTPError as error:
         with error:
             raise _status_fault(error, offset) from None
@@ -117,8 +131,10 @@ def may_lead(url: str, target: str) -> bool:
     return urlsplit(target).scheme in allowed
 
 
-def _opener() -> urllib.request.OpenerDirector:
+def _opener(cookies: CookieJar | None) -> urllib.request.OpenerDirector:
     opener = urllib.request.OpenerDirector()
+    if cookies is not None:
+        opener.add_handler(urllib.request.HTTPCookieProcessor(cookies))
     for handler in (
         *(urllib.request.ProxyHandler(), urllib.request.UnknownHandler(), urllib.request.HTTPHandler()),
         *(urllib.request.HTTPSHandler(), urllib.request.HTTPDefaultErrorHandler(), _Redirects()),

@@ -1,4 +1,4 @@
-"""One public file of known size and checksum, fetched whole and verified, or not at all.
+"""One public file of known size, fetched whole and verified, or not at all.
 
 What has arrived lies in `<name>.part` and survives an interruption: the next call asks for the rest (HTTP Range). A
 server that cannot give the rest sends all of it again. A lost connection is tried anew, after longer and longer waits.
@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from http.cookiejar import CookieJar
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -26,16 +27,26 @@ _SLOWEST_BYTES_PER_SECOND = 1000
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A public file. size: of the whole file, bytes; sha256: of all its bytes, hex."""
+    """A public file.
+
+    size: of the whole file, bytes. sha256: of all its bytes, hex, or None where nobody knows it. title: its name, where
+    that is not the last part of the address.
+    """
 
     url: str
     size: int
-    sha256: str
+    sha256: str | None
+    title: str = ""
 
     @property
     def name(self) -> str:
-        """The last part of the address."""
-        return self.url.rpartition("/")[2]
+        """What users call it."""
+        return self.title or self.url.rpartition("/")[2]
+
+
+#: Gives the address of a file anew before each try: those of some servers hold for a while only. It may raise
+#: RefusedError or LostError.
+Locate = Callable[[], str]
 
 
 @dataclass(frozen=True)
@@ -57,11 +68,21 @@ class Patience:
 PATIENT = Patience()
 
 
-def fetch(file: RemoteFile, target: Path, *, remedy: str, patience: Patience = PATIENT) -> None:
+def fetch(
+    file: RemoteFile,
+    target: Path,
+    *,
+    remedy: str,
+    patience: Patience = PATIENT,
+    locate: Locate | None = None,
+    cookies: CookieJar | None = None,
+) -> None:
     """Fetch `file` to `target`, unless it is there. One process at a time: hold `alone` meanwhile.
 
     Args:
         remedy: what a user can do where it fails, as the end of the error's line.
+        locate: gives the address of each try, where `file.url` is only the place where users look.
+        cookies: of this download, sent back to the server that set them.
 
     Raises SplashbenchError with the address and the reason, or where the disk has no room.
     """
@@ -73,7 +94,7 @@ def fetch(file: RemoteFile, target: Path, *, remedy: str, patience: Patience = P
     part = target.with_name(f"{target.name}.part")
     while True:
         try:
-            continued = _Download(file, part, patience).run()
+            continued = _Download(file, part, patience, locate, cookies).run()
         except (RefusedError, LostError) as error:
             raise SplashbenchError(f"{file.url} could not be fetched: {error}; {remedy}") from None
         if _is_whole(file, part):
@@ -86,7 +107,9 @@ def fetch(file: RemoteFile, target: Path, *, remedy: str, patience: Patience = P
 
 
 def _is_whole(file: RemoteFile, path: Path) -> bool:
-    return path.stat().st_size == file.size and sha256_file(path) == file.sha256
+    if path.stat().st_size != file.size:
+        return False
+    return file.sha256 is None or sha256_file(path, file.size) == file.sha256
 
 
 @contextmanager
@@ -110,8 +133,11 @@ def alone(target: Path, tell: Callable[[str], None]) -> Iterator[None]:
 class _Download:
     """Brings the file `part` to its full size."""
 
-    def __init__(self, file: RemoteFile, part: Path, patience: Patience) -> None:
+    def __init__(
+        self, file: RemoteFile, part: Path, patience: Patience, locate: Locate | None, cookies: CookieJar | None
+    ) -> None:
         self._file, self._part, self._patience = file, part, patience
+        self._locate, self._cookies = locate, cookies
         self._continued = 0 < self._have() <= file.size  # whether bytes of an earlier call are in it
         if not self._continued:
             part.unlink(missing_ok=True)
@@ -151,8 +177,11 @@ class _Download:
     def _try(self, meter: Meter) -> None:
         """One request. Returns with a file of full size, else raises."""
         have = self._have()
+        url = self._file.url if self._locate is None else self._locate()
         try:
-            with ask(self._file.url, have, self._patience.timeout_seconds) as answer:
+            with ask(url, have, self._patience.timeout_seconds, self._cookies) as answer:
+                if self._locate is not None and answer.is_page:  # the address has run out: once more, with a new one
+                    raise LostError("a web page came instead of the file")
                 if answer.total not in (None, self._file.size):
                     self._refuse_size(f"{answer.total}")
                 if answer.start not in (0, have):

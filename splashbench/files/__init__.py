@@ -15,9 +15,10 @@ from splashbench.files.atomic import (
     raise_if_disk_full,
     write_text,
 )
-from splashbench.files.contents import sha256_file, tree_bytes
+from splashbench.files.contents import Listing, list_files, sha256_file, tree_bytes
 from splashbench.files.documents import (
     MAX_JSON_BYTES,
+    MAX_NESTING,
     read_document,
     read_json,
     read_model,
@@ -31,25 +32,34 @@ from splashbench.files.images import (
     jpeg_bytes,
     read_gray,
     read_image,
+    read_png,
     read_rgba,
+    require_png,
     write_image,
     write_png,
 )
-from splashbench.files.places import require_file_place, require_folder_place, require_plain_file
+from splashbench.files.places import require_file_place, require_folder_place
+from splashbench.files.plain import MAX_FILE_BYTES, is_plain_file, open_plain, read_plain, require_plain_file
 
 __all__ = [
+    "MAX_FILE_BYTES",
     "MAX_JSON_BYTES",
+    "MAX_NESTING",
     "MAX_NPZ_BYTES",
     "MAX_PIXELS",
     "NO_ROOM",
+    "Listing",
     "as_asked",
     "atomic_directory",
     "atomic_path",
     "compressed_bytes",
     "files_together",
     "image_size",
+    "is_plain_file",
     "is_staged_for",
     "jpeg_bytes",
+    "list_files",
+    "open_plain",
     "raise_if_disk_full",
     "read_document",
     "read_gray",
@@ -57,10 +67,13 @@ __all__ = [
     "read_json",
     "read_model",
     "read_npz",
+    "read_plain",
+    "read_png",
     "read_rgba",
     "require_file_place",
     "require_folder_place",
     "require_plain_file",
+    "require_png",
     "sha256_file",
     "tree_bytes",
     "validate_model",

@@ -1,27 +1,42 @@
-"""Archives of arrays (.npz) from strangers: no pickles, bounded sizes, finite numbers."""
+"""Archives of arrays (.npz) from strangers: no pickles, bounded sizes, finite numbers.
+
+An array's header is held against the archive before anything is allocated, and only arrays that are asked for are
+unpacked.
+"""
 
 from __future__ import annotations
 
 import bz2
+import io
 import math
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files.atomic import atomic_path
-from splashbench.files.places import require_plain_file
+from splashbench.files.plain import open_plain
 
-MAX_NPZ_BYTES = 4 << 30
+#: Of all arrays of a file together, unpacked.
+MAX_NPZ_BYTES = 2 << 30
+MAX_ARRAYS = 1000
 # zipfile: RuntimeError for encrypted archives, NotImplementedError for compressions that it does not know.
 _DAMAGED = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 # LZMA is not among them: its decoder allocates what a file asks for.
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_LARGEST_NUMBER = 8  # bytes
+_MAX_DIMENSIONS = 16
+# zipfile reads the list of entries in one go: as long as the file says, each of them some 600 bytes in memory.
+_MAX_READ = 4 << 20
+_CHUNK = 1 << 20
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -38,20 +53,29 @@ def compressed_bytes(arrays: Mapping[str, np.ndarray]) -> int:
     return sum(len(bz2.compress(np.ascontiguousarray(array).tobytes())) for array in arrays.values())
 
 
-def _require_its_size(stream: IO[bytes], entry: zipfile.ZipInfo) -> None:
-    """Raise ValueError where an array's header states another size than the archive: numpy allocates what it states."""
-    try:
-        version = np.lib.format.read_magic(stream)
-    except ValueError:
-        return  # no array, which is said later if it is asked for
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"{entry.filename} has a header of version {version}")
-    shape, _, kind = readers[version](stream)
-    if kind.hasobject:
-        return  # which is refused later
-    if stream.tell() + math.prod(shape) * kind.itemsize != entry.file_size:
-        raise ValueError(f"{entry.filename} states {kind} {shape} in {entry.file_size} bytes")
+class _ShortReads(io.RawIOBase):
+    """A file that gives no more than _MAX_READ bytes at once."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return self._stream.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._stream.tell()
+
+    def read(self, size: int = -1) -> bytes:
+        content = self._stream.read(_MAX_READ + 1 if size < 0 else min(size, _MAX_READ + 1))
+        if len(content) > _MAX_READ:
+            raise ValueError("its list of entries is too long")
+        return content
 
 
 def read_npz(
@@ -60,7 +84,7 @@ def read_npz(
     optional: Mapping[str, int] | None = None,
     *,
     max_bytes: int | None = None,
-) -> dict[str, Any]:
+) -> dict[str, NDArray[Any]]:
     """Read named arrays with the number of dimensions given, without pickles and within limits.
 
     `names` and `optional` map an array's name to its number of dimensions. Returns the arrays of `names`, and those of
@@ -70,35 +94,71 @@ def read_npz(
     path = Path(path)
     limit = MAX_NPZ_BYTES if max_bytes is None else max_bytes
     try:
-        require_plain_file(path)
-        with zipfile.ZipFile(path) as archive:
-            # The sizes are the archive's claims, but numpy's reader never inflates beyond them.
-            entries = archive.infolist()
-            if sum(entry.file_size for entry in entries) > limit:
-                raise SplashbenchError(f"{path} unpacks to more than {limit / 2**30:.3g} GiB; refused")
-            unknown = [entry.filename for entry in entries if entry.compress_type not in _COMPRESSIONS]
-            if unknown:
-                raise NotImplementedError(f"{unknown[0]!r} is neither deflated nor bzipped")
-            for entry in entries:
-                with archive.open(entry) as stream:
-                    _require_its_size(stream, entry)
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive.files]
-            if missing:
-                raise SplashbenchError(f"{path} lacks the array {missing[0]!r}; write it again")
-            ranks = dict(names) | {name: rank for name, rank in (optional or {}).items() if name in archive.files}
-            arrays = {name: archive[name] for name in ranks}
+        with open_plain(path) as (stream, _), zipfile.ZipFile(_ShortReads(stream)) as archive:
+            entries = {entry.filename: entry for entry in archive.infolist()}
+            _require_bounded(path, archive.infolist(), limit)
+            ranks = dict(names) | {name: rank for name, rank in (optional or {}).items() if _entry(entries, name)}
+            arrays = {}
+            for name, rank in ranks.items():
+                if (entry := _entry(entries, name)) is None:
+                    raise SplashbenchError(f"{path} lacks the array {name!r}; write it again")
+                with archive.open(entry) as member:
+                    arrays[name] = _read_array(path, name, rank, member, entry.file_size)
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; check the path") from None
     except _DAMAGED as error:
         raise SplashbenchError(f"{path} is not a readable .npz without pickles ({error}); write it again") from None
     for name, array in arrays.items():
-        if not isinstance(array, np.ndarray):  # numpy hands out what is no array as bytes
-            raise SplashbenchError(f"{path}: {name} is not an array; write it again")
-        if array.ndim != ranks[name]:
-            raise SplashbenchError(f"{path}: {name} has {array.ndim} dimensions, not {ranks[name]}; write it again")
-        if array.dtype.kind not in "biuf":
-            raise SplashbenchError(f"{path}: {name} holds {array.dtype}, not numbers; write it again")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise SplashbenchError(f"{path}: {name} has NaN or infinite entries; write finite numbers")
     return arrays
+
+
+def _require_bounded(path: Path, entries: list[zipfile.ZipInfo], limit: int) -> None:
+    """Raise for what an archive's list of entries says already. Sizes are its claims; nothing is read beyond them."""
+    if len(entries) > MAX_ARRAYS:
+        raise SplashbenchError(f"{path} holds more than {MAX_ARRAYS} arrays; refused")
+    if sum(entry.file_size for entry in entries) > limit:
+        raise SplashbenchError(f"{path} unpacks to more than {limit / 2**30:.3g} GiB; refused")
+    unknown = [entry.filename for entry in entries if entry.compress_type not in _COMPRESSIONS]
+    if unknown:
+        raise NotImplementedError(f"{unknown[0]!r} is neither deflated nor bzipped")
+
+
+def _entry(entries: Mapping[str, zipfile.ZipInfo], name: str) -> zipfile.ZipInfo | None:
+    return entries.get(f"{name}.npy") or entries.get(name)
+
+
+def _read_array(path: Path, name: str, rank: int, stream: IO[bytes], size: int) -> NDArray[Any]:
+    """The array in `stream`, of `size` bytes with its header. numpy would allocate whatever the header states."""
+    try:
+        version = np.lib.format.read_magic(stream)
+    except ValueError:
+        raise SplashbenchError(f"{path}: {name} is not an array; write it again") from None
+    if version not in _HEADERS:
+        raise ValueError(f"{name} has a header of version {version}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of notations of old
+            shape, in_columns, kind = _HEADERS[version](stream)
+    # A header is Python's own notation, and numpy lets whatever reading that raises through.
+    except Exception as error:
+        raise ValueError(f"{name} has no valid header ({str(error)[:200]})") from None
+    if kind.hasobject:
+        raise ValueError(f"{name} holds objects")
+    if len(shape) != rank:
+        raise SplashbenchError(f"{path}: {name} has {len(shape)} dimensions, not {rank}; write it again")
+    if kind.kind not in "biuf" or kind.itemsize > _LARGEST_NUMBER:
+        raise SplashbenchError(f"{path}: {name} holds {kind}, not numbers; write it again")
+    n_bytes = math.prod(shape) * kind.itemsize
+    if min(shape, default=0) < 0 or len(shape) > _MAX_DIMENSIONS or stream.tell() + n_bytes != size:
+        raise ValueError(f"{name} states {kind} {shape} in {size} bytes")
+    array: NDArray[Any] = np.empty(math.prod(shape), kind)
+    target = array.view(np.uint8)
+    for start in range(0, n_bytes, _CHUNK):
+        part = stream.read(min(_CHUNK, n_bytes - start))
+        if len(part) != min(_CHUNK, n_bytes - start):
+            raise EOFError(f"{name} ends early")
+        target[start : start + len(part)] = np.frombuffer(part, np.uint8)
+    stream.read(1)  # beyond the end: zipfile compares the checksum then
+    return array.reshape(shape[::-1]).T if in_columns else array.reshape(shape)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from splashbench.errors import DiskFullError, SplashbenchError
 from splashbench.files.places import require_file_place, require_folder_place
+from splashbench.files.plain import read_plain
 
 #: What the system says where a file has no room: the disk, the user's quota or the limit of a file's size is reached.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -169,10 +170,8 @@ def _require_replaceable(
 def _has_keys(path: Path, keys: Collection[str]) -> bool:
     """Whether `path` is a JSON object that has all of `keys`."""
     try:
-        if path.stat().st_size > _MAX_MARKER_BYTES:
-            return False
-        data = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        data = json.loads(read_plain(path, _MAX_MARKER_BYTES))
+    except (SplashbenchError, OSError, ValueError, RecursionError):
         return False
     return isinstance(data, dict) and set(keys) <= set(data)
 
@@ -206,6 +205,10 @@ def files_together(directory: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8, whole or not at all."""
+    """Write `text` as UTF-8, whole or not at all. Raises SplashbenchError for text that is none (a lone surrogate)."""
+    try:
+        content = text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise SplashbenchError(f"{path} cannot be written as UTF-8 ({error}); change the text") from None
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(content)

@@ -32,14 +32,3 @@ def require_folder_place(directory: Path) -> None:
         raise SplashbenchError(f"{place} is a file; give another place for {directory}")
     if not os.access(place, os.W_OK | os.X_OK):
         raise SplashbenchError(f"{place} may not be written; give another place for {directory}")
-
-
-def require_plain_file(path: Path) -> None:
-    """Raise SplashbenchError for a folder, a pipe or a device, whose reading would fail oddly or never end.
-
-    A missing file passes: its reader reports it.
-    """
-    if path.exists() and not path.is_file():
-        raise SplashbenchError(
-            f"{path} is {'a folder' if path.is_dir() else 'a device or pipe'}, not a file; restore it"
-        )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files.atomic import atomic_path
-from splashbench.files.places import require_plain_file
+from splashbench.files.plain import open_plain
 
 #: More points than this are no reconstruction that could be rendered.
 MAX_POINTS = 20_000_000
@@ -81,14 +81,13 @@ def read_point_cloud(path: Path) -> PointCloud:
     """
     path = Path(path)
     try:
-        require_plain_file(path)
-        with path.open("rb") as stream:
+        with open_plain(path) as (stream, size):
             head = stream.read(_MAX_HEADER_BYTES)
         end = _END.search(head)
         if not head.startswith((b"ply\n", b"ply\r\n")) or end is None:
             raise SplashbenchError(f"{path} is no .ply (it has no such header); give the file as the code saved it")
         count, kind = _header(path, head[: end.start()].decode("ascii", "replace").splitlines())
-        available = (path.stat().st_size - end.end()) // kind.itemsize
+        available = (size - end.end()) // kind.itemsize
         if count > available:
             raise SplashbenchError(f"{path} is cut short: {available} of {count} points are there; copy it again")
         points = np.fromfile(path, kind, count, offset=end.end())

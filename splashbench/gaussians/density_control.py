@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splashbench.gaussians.dynamic_model import Splats, rotation_matrices
 from splashbench.gaussians.optimizer import RowOptimizer
-from splashbench.gaussians.screen_gradients import screen_gradients
+from splashbench.gaussians.screen_gradients import screen_gradients_of
 from splashbench.scene import Camera
 
 _SHRINK = 1.6
@@ -63,7 +63,9 @@ class DensityControl:
 
     def _forget(self) -> None:
         count = len(self.optimizer.model.get_parameter("positions"))
-        self._gradient, self._visits = np.zeros(count, np.float32), np.zeros(count, np.int32)
+        device = self.optimizer.model.get_parameter("positions").device
+        self._gradient = torch.zeros(count, device=device)
+        self._visits = torch.zeros(count, dtype=torch.int32, device=device)
 
     def wants_gradients(self, step: int) -> bool:
         """Whether `observe` is to be called at `step`."""
@@ -71,10 +73,9 @@ class DensityControl:
 
     def observe(self, camera: Camera, splats: Splats, gradients: Tensor) -> None:
         """Take note of a view; gradients: of its loss by the means [N, 3]."""
-        pulls = gradients.numpy()
-        rows = slice(None) if splats.rows is None else splats.rows.numpy()
-        self._gradient[rows] += screen_gradients(camera, splats.means.detach().numpy(), pulls)
-        self._visits[rows] += pulls.any(axis=1)
+        rows = slice(None) if splats.rows is None else splats.rows
+        self._gradient[rows] += screen_gradients_of(camera, splats.means.detach(), gradients)
+        self._visits[rows] += gradients.any(dim=1)
 
     def after_step(self, step: int) -> None:
         """What is due after step number `step`, counted from 0."""
@@ -91,7 +92,7 @@ class DensityControl:
 
     def _bright(self) -> np.ndarray:
         """bool [N]: primitives to keep; never none, since a model of none could not be fitted further."""
-        opacity = torch.sigmoid(self.optimizer.model.get_parameter("opacity_logits").detach()).numpy()
+        opacity = torch.sigmoid(self.optimizer.model.get_parameter("opacity_logits").detach()).cpu().numpy()
         bright = opacity >= self.settings.opacity
         if not bright.any():
             bright[opacity.argmax()] = True
@@ -100,18 +101,18 @@ class DensityControl:
     @torch.no_grad()
     def _round(self) -> None:
         settings, model = self.settings, self.optimizer.model
-        mean = self._gradient / np.maximum(self._visits, 1)
+        mean = self._gradient.cpu().numpy() / np.maximum(self._visits.cpu().numpy(), 1)
         bright = self._bright()
         mean[~bright] = 0
         chosen = np.flatnonzero(mean > settings.gradient)
         room = max(0, settings.max_gaussians - int(bright.sum()))
         chosen = np.sort(chosen[np.argsort(-mean[chosen], kind="stable")][:room])
-        rows = torch.from_numpy(chosen)
+        rows = torch.from_numpy(chosen).to(self._gradient.device)
         new = {name: model.get_parameter(name).detach()[rows] for name in self.optimizer.rows}
         scales = torch.exp(new["log_scales"])
         large = scales.max(dim=1).values > settings.large
         # A clone stays where it is; of a split, one half takes the old row's place and the other is new.
-        drawn = torch.randn(2, len(rows), 3) * scales * large[:, None]
+        drawn = torch.randn(2, len(rows), 3).to(scales) * scales * large[:, None]
         shift = (rotation_matrices(new["quaternions"]) @ drawn[..., None])[..., 0]
         smaller = new["log_scales"] - float(np.log(_SHRINK)) * large[:, None]
         new["log_scales"] = smaller

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,18 @@ class DynamicModel(nn.Module, ABC):
     """
 
     backdrop: Tensor | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model's tables lie."""
+        return next(self.parameters()).device
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DynamicModel:
+        # What moves a model to a device moves its parameters and buffers alone; the backdrop is neither.
+        super()._apply(fn, recurse)
+        if self.backdrop is not None:
+            self.backdrop = fn(self.backdrop)
+        return self
 
     def at(self, time: float) -> Any:
         """What all views of one instant share, such as a network's output; it is handed to `splats`."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,7 +21,7 @@ from splashbench.gaussians.color_loss import l1
 from splashbench.gaussians.dynamic_model import DynamicModel, Splats
 from splashbench.gaussians.optimizer import RowOptimizer
 from splashbench.gaussians.photographs import Photographs
-from splashbench.gaussians.ssim import SsimTarget, ssim
+from splashbench.gaussians.ssim import SsimTarget, ssim, ssim_by_torch
 from splashbench.scene import Camera
 
 _SSIM_WEIGHT = 0.2
@@ -88,14 +89,12 @@ def fit_dynamic(
             splats.means = splats.means.clone()
             splats.means.retain_grad()
             image = model.view(splats, view.camera, time)
-            loss = (1 - _SSIM_WEIGHT) * l1(image, view.image, np.ones(view.image.shape[:2], bool))
-            truth = view.image * np.float32(1 / 255)
-            loss = loss + _SSIM_WEIGHT * (1 - ssim(image, SsimTarget(truth)))
+            loss, error = _loss_and_error(image, view.image)
             if splats.penalty is not None:
                 loss = loss + splats.penalty
             total = loss if total is None else total + loss
             seen.append((view.camera, splats, image))
-            errors.append(float(((image.detach().numpy() - truth) ** 2).mean()))
+            errors.append(error)
         assert total is not None
         loss = total / len(views)
         if not math.isfinite(float(loss.detach())):
@@ -110,8 +109,26 @@ def fit_dynamic(
                     density.observe(camera, splats, splats.means.grad * len(views))
         optimizer.step()
         density.after_step(step)
-        psnr[step] = -10 * math.log10(max(float(np.mean(errors)), 1e-10))
+        psnr[step] = -10 * math.log10(max(float(np.mean([float(error) for error in errors])), 1e-10))
         if step % 10 == 0:
             progress(step / optimizer.iterations)
         after_step()
     return FitHistory(psnr)
+
+
+def _loss_and_error(image: Tensor, photograph: NDArray[np.uint8]) -> tuple[Tensor, Tensor | float]:
+    """The loss of `image` [H, W, 3] against a photograph of that size, and the mean squared error."""
+    if image.is_cuda:
+        return _on_device(image, photograph)
+    truth = photograph * np.float32(1 / 255)
+    loss = (1 - _SSIM_WEIGHT) * l1(image, photograph, np.ones(photograph.shape[:2], bool))
+    loss = loss + _SSIM_WEIGHT * (1 - ssim(image, SsimTarget(truth)))
+    return loss, float(((image.detach().numpy() - truth) ** 2).mean())
+
+
+def _on_device(image: Tensor, photograph: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
+    """The same where `image` lies; the error stays there until the step is done."""
+    truth = torch.tensor(photograph, device=image.device) / 255
+    loss = (1 - _SSIM_WEIGHT) * (image - truth).abs().mean()
+    loss = loss + _SSIM_WEIGHT * (1 - ssim_by_torch(image, truth.permute(2, 0, 1)))
+    return loss, (image.detach() - truth).square().mean()

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from splashbench.background.depth import common_target
 from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import atomic_path, read_npz
-from splashbench.gaussians.dynamic_model import DynamicModel
+from splashbench.gaussians.dynamic_model import DynamicModel, Splats
 from splashbench.gaussians.fitting import FitHistory
 from splashbench.gaussians.photographs import unit_time
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Render
 from splashbench.observe.consistency import silhouette_consistent
-from splashbench.render import counters, rasterize_arrays
+from splashbench.render import counters, rasterize
 from splashbench.render.constants import MIN_ALPHA
 from splashbench.scene import Camera, Gaussians, Particles, TrainingScene, look_at
 
@@ -59,14 +59,21 @@ class MixedFitted(Fitted):
         unit, camera = self.model_time(time, camera), self.lens(camera)
         with one_torch_thread():
             splats = self.model.splats(self.model.at(unit), camera)
-            image = self.model.view(splats, camera, unit).clamp(0, 1).numpy()
-        liquid = self.liquid(int(np.abs(self.scene.times - time).argmin()))
-        if splats.rows is not None:
-            liquid = liquid[splats.rows.numpy()]
-        means, factors, opacities = (t.numpy()[liquid] for t in (splats.means, splats.factors, splats.opacities))
+            image = self.model.view(splats, camera, unit).clamp(0, 1).cpu().numpy()
+        liquid = self._of_splats(self.liquid(int(np.abs(self.scene.times - time).argmin())), splats)
+        chosen = torch.from_numpy(liquid).to(self.model.device)
+        means, factors, opacities = (t[chosen] for t in (splats.means, splats.factors, splats.opacities))
         with counters.uncounted():  # asked for by the protocol, no part of the method's image
-            _, alpha = rasterize_arrays(means, factors, opacities, None, camera)
-        return Render(image, alpha)
+            _, alpha = rasterize(means, factors, opacities, None, camera)
+        return Render(image, alpha.cpu().numpy())
+
+    def to_device(self, device: str) -> None:
+        self.model.to(device)
+
+    @staticmethod
+    def _of_splats(values: NDArray[np.bool_], splats: Splats) -> NDArray[np.bool_]:
+        """Of `values`, one for each of the model's Gaussians, those of `splats`."""
+        return values if splats.rows is None else values[splats.rows.cpu().numpy()]
 
     def liquid(self, t: int) -> NDArray[np.bool_]:
         """bool [N]: the Gaussians that the silhouettes of timestep `t` allow to be liquid."""
@@ -85,7 +92,7 @@ class MixedFitted(Fitted):
     def _means(self, time: float) -> NDArray[np.float32]:
         """Means [N, 3] of all Gaussians at the model's `time`."""
         with one_torch_thread():
-            return np.asarray(self.model.means(time).numpy())
+            return np.asarray(self.model.means(time).cpu().numpy())
 
     @torch.no_grad()
     def _drawn(self, t: int, count: int) -> NDArray[np.bool_]:
@@ -95,9 +102,8 @@ class MixedFitted(Fitted):
             state = self.model.at(self.model_time(float(self.scene.times[t])))
             for camera in self._masked.cameras.values():
                 splats = self.model.splats(state, camera)
-                drawn[slice(None) if splats.rows is None else splats.rows.numpy()] |= (
-                    splats.opacities.numpy() >= MIN_ALPHA
-                )
+                rows = slice(None) if splats.rows is None else splats.rows.cpu().numpy()
+                drawn[rows] |= splats.opacities.cpu().numpy() >= MIN_ALPHA
         return drawn
 
     def particles(self) -> Particles | None:
@@ -121,11 +127,9 @@ class MixedFitted(Fitted):
         with one_torch_thread():
             splats = self.model.splats(self.model.at(self.model_time(time)), camera)
             colors = self.model.colors(splats).clamp(0, 1)
-        chosen = self.liquid(int(np.abs(self.scene.times - time).argmin()))
-        if splats.rows is not None:
-            chosen = chosen[splats.rows.numpy()]
+        chosen = self._of_splats(self.liquid(int(np.abs(self.scene.times - time).argmin())), splats)
         parts = (splats.means, splats.factors, splats.opacities, colors)
-        return Gaussians(*(part.numpy()[chosen == liquid] for part in parts))
+        return Gaussians(*(part.cpu().numpy()[chosen == liquid] for part in parts))
 
     def _wide_camera(self, eye: NDArray) -> Camera:
         """A camera at `eye` that nearly everything before it is seen by: models leave out what none could see."""
@@ -140,9 +144,9 @@ class MixedFitted(Fitted):
         )
 
     def save(self, directory: Path) -> None:
-        arrays = {name: tensor.detach().numpy() for name, tensor in self.model.state_dict().items()}
+        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in self.model.state_dict().items()}
         if self.model.backdrop is not None:
-            arrays["backdrop"] = self.model.backdrop.numpy()
+            arrays["backdrop"] = self.model.backdrop.cpu().numpy()
         with atomic_path(directory / MODEL_FILE) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **arrays)
         if self.history is not None:

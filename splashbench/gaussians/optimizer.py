@@ -106,16 +106,16 @@ class RowOptimizer:
 
     def replace_rows(self, kept: NDArray[np.int64], new: Mapping[str, Tensor]) -> None:
         """Keep the rows `kept` and append `new` ones, given for each of `rows`; these start without moments."""
-        index = torch.from_numpy(kept)
         for group in self.adam.param_groups:
             name = group["name"]
             if name not in self.rows:
                 continue
             old = getattr(self.model, name)
-            parameter = nn.Parameter(torch.cat([old.detach()[index], new[name]]))
+            index, rows = torch.from_numpy(kept).to(old.device), new[name].to(old.device)
+            parameter = nn.Parameter(torch.cat([old.detach()[index], rows]))
             state = self.adam.state.pop(old, None)
             if state:
-                blank = torch.zeros_like(new[name])
+                blank = torch.zeros_like(rows)
                 moments = {key: torch.cat([state[key][index], blank]) for key in ("exp_avg", "exp_avg_sq")}
                 self.adam.state[parameter] = {**state, **moments}
             setattr(self.model, name, parameter)

@@ -17,6 +17,8 @@ from typing import Protocol
 
 import numpy as np
 
+from splashbench.harness.channel import GOES_ON, PAUSED
+
 #: Seconds of the fit at which a state is asked for: two for each doubling, for a month. Each is a little early, so that
 #: what comes at the first offer after it counts within 10, 30, 60, 120 and 300 seconds.
 MARKS = tuple(4.8 * 2 ** (k / 2) for k in range(40))
@@ -39,13 +41,21 @@ class Checkpoints:
     """
 
     def __init__(
-        self, folder: Path, marks: Sequence[float], elapsed: Callable[[], float], synchronise: Callable[[], None]
+        self,
+        folder: Path,
+        marks: Sequence[float],
+        elapsed: Callable[[], float],
+        synchronise: Callable[[], None],
+        tell: Callable[[str], None] = lambda mark: None,
     ) -> None:
-        """marks: rising seconds. elapsed: those of the fit so far. synchronise: waits for what a device computes."""
+        """marks: rising seconds. elapsed: those of the fit so far. synchronise: waits for what a device computes.
+
+        tell: is told when the fit pauses and goes on (channel.py).
+        """
         self.seconds: list[float] = []
         self.spent = 0.0
         self._folder, self._elapsed, self._synchronise = folder, elapsed, synchronise
-        self._left = list(reversed(marks))
+        self._left, self._tell = list(reversed(marks)), tell
 
     def offer(self, state: Callable[[], Savable], milestone: bool = False) -> None:
         """Take what `state` makes where a mark has come, or a `milestone` was reached."""
@@ -53,6 +63,7 @@ class Checkpoints:
             return
         self._synchronise()
         elapsed, start = self._elapsed(), time.perf_counter()
+        self._tell(PAUSED)
         place = self._folder / f"{len(self.seconds):02d}"
         place.mkdir(parents=True)
         with _random_numbers_kept():
@@ -61,6 +72,7 @@ class Checkpoints:
         # Of the marks that one long step went past, one state serves all.
         while self._left and self._left[-1] <= elapsed:
             self._left.pop()
+        self._tell(GOES_ON)
         self.spent += time.perf_counter() - start
 
 

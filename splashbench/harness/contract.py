@@ -14,6 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -311,6 +312,10 @@ class Fitted(ABC):
         """How fast the liquid moves at `time`, or None for a method whose motion is not that of a liquid."""
         return None
 
+    def to_device(self, device: str) -> None:
+        """Render on `device` from now on (one of `Method.devices`); where this is not overridden, on the CPU still."""
+        return None
+
     @abstractmethod
     def save(self, directory: Path) -> None:
         """Write the model into `directory`, which is there and empty, without pickles.
@@ -320,6 +325,16 @@ class Fitted(ABC):
         """
 
 
+def _with_folder(load: Callable[..., Fitted]) -> Callable[..., Fitted]:
+    """`load`, given its folder as a Path in any case."""
+
+    @wraps(load)
+    def loaded(self: Method, directory: Path | str, scene: TrainingScene) -> Fitted:
+        return load(self, Path(directory), scene)
+
+    return loaded
+
+
 class Method(ABC):
     """A reconstruction method. Register the class under the entry-point group `splashbench.methods`."""
 
@@ -327,7 +342,7 @@ class Method(ABC):
     title: ClassVar[str]
     version: ClassVar[str] = "1"
     Config: ClassVar[type[MethodConfig]] = MethodConfig
-    #: What `Run.device` may be; a GPU method lists "cuda" too.
+    #: What `Run.device` may be; a GPU method lists "cuda" too, and saves what any machine can load.
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     #: Which limits of `Budget` the method keeps to; with others the user is told that it does not.
     budgets: ClassVar[tuple[str, ...]] = ()
@@ -336,9 +351,19 @@ class Method(ABC):
     #: True where one set of primitives holds background and liquid, see docs/protocol.md, "mixed methods".
     mixed: ClassVar[bool] = False
 
+    def __init_subclass__(cls, **more: Any) -> None:
+        """Let `load` take its folder as text too, as `Scene.open` does."""
+        super().__init_subclass__(**more)
+        if "load" in cls.__dict__:
+            cls.load = _with_folder(cls.__dict__["load"])  # type: ignore[method-assign]
+
     def supports(self, scene: TrainingScene) -> Support:
         """Whether this method can take `scene`; a reason where not."""
         return Support(True)
+
+    def device_fault(self, device: str) -> str | None:
+        """Why `device`, one of `devices`, cannot be used on this machine, with the remedy; None where it can."""
+        return None
 
     @abstractmethod
     def fit(self, scene: TrainingScene, config: Any, run: Run) -> Fitted:
@@ -346,4 +371,7 @@ class Method(ABC):
 
     @abstractmethod
     def load(self, directory: Path, scene: TrainingScene) -> Fitted:
-        """Read what `Fitted.save` wrote, in a fresh process. Rendering must equal that of the saved model."""
+        """Read what `Fitted.save` wrote, in a fresh process. Rendering must equal that of the saved model.
+
+        Whoever calls it may give `directory` as text; the method gets a Path.
+        """

@@ -7,18 +7,27 @@ import platform
 from pathlib import Path
 
 
-def describe() -> dict[str, str | int | float]:
-    """Processor, cores this process may use, memory, operating system and Python of this machine."""
+def describe(device: str = "cpu") -> dict[str, str | int | float]:
+    """Processor, cores this process may use, memory, operating system and Python of this machine; the GPU where
+    `device` is "cuda", so that what it measures stands apart from what processors do."""
     import psutil
 
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    gpu = _gpu_name() if device.startswith("cuda") else None
     return {
+        **({"gpu": gpu} if gpu else {}),
         "cpu": _cpu_name(),
         "cores": affinity,
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
     }
+
+
+def _gpu_name() -> str | None:
+    import torch
+
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else None
 
 
 def _cpu_name() -> str:

@@ -1,4 +1,4 @@
-"""Messages between the harness and its child process: a request file in, progress lines and an outcome file out."""
+"""Messages between the harness and its child process: a request file in, progress lines and an outcome out."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ class Request(BaseModel):
     scratch: str
     model: str
     output: str
-    result: str
     progress: str
     timing_frames: int
     exr: bool
@@ -58,23 +57,26 @@ class Failure(Exception):
 
 
 class Outcome(BaseModel):
-    """How a phase ended, as the harness's own code in the child process saw it.
+    """How a phase ended, as the harness's own code in the child process tells it.
 
-    checkpoints: seconds of the fit at each state that was saved; checkpoint_seconds: what saving them all took.
+    It comes from the method's process, so nothing in it is a measurement of time: that is taken outside (clock.py).
+
+    Attributes:
+        overhead_seconds: of the fit, spent on what runs of a study share; believed in studies alone.
+        checkpoints: seconds of the fit at each state, as its own clock told; believed where the keeper's says as much.
+        render_fps: checked against the time that all timed frames took.
     """
 
     model_config = ConfigDict(extra="forbid")
     status: Status = Status.OK
     reason: str = ""
-    seconds: float | None = None
+    overhead_seconds: float = 0.0
     reused: dict[str, float] = {}
     stages: dict[str, float] = {}
     notes: dict[str, str] = {}
     decisions: list[Decision] = []
     checkpoints: list[float] = []
-    checkpoint_seconds: float | None = None
     render_fps: float | None = None
-    timed_frames: int | None = None
     primitives_per_frame: float | None = None
     peak_device_memory_bytes: int | None = None
     settings: dict[str, Any] = {}

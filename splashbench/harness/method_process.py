@@ -1,7 +1,8 @@
 """The child process in which a method runs, fits or renders, as a request file says.
 
-This is the harness's code around the method's: it holds the clock, checks every render, and writes what came out.
-Fitting and rendering are two processes, so that a model which renders only in the memory that fitted it fails.
+This is the harness's code around the method's: it marks when the fit starts and ends, checks every render, and tells
+what came out. The clock is outside (keeper.py), since a method can do whatever this process can. Fitting and rendering
+are two processes, so that a model which renders only in the memory that fitted it fails.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import raise_if_disk_full, read_model, write_model
+from splashbench.files import raise_if_disk_full, read_model
+from splashbench.harness.channel import FIT_ENDS, FIT_STARTS, SAVED, TIMING_ENDS, TIMING_STARTS, Channel
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Method, Run
 from splashbench.harness.discovery import load_method
@@ -29,10 +31,10 @@ from splashbench.submission.exr import write_exr
 WARM_UP_FRAMES = 10
 
 
-def carry_out(request_path: str) -> int:
-    """Carry out the request; always leaves an Outcome behind unless the process dies or the disk is full."""
-    request = read_model(Path(request_path), Request)
-    phases: dict[str, Callable[[Request, Any, TrainingScene], Outcome]] = {
+def carry_out(request_path: str, channel: Channel | None = None) -> int:
+    """Carry out the request; always tells `channel` an Outcome unless the process dies or the disk is full."""
+    request, channel = read_model(Path(request_path), Request), channel or Channel()
+    phases: dict[str, Callable[[Request, Any, TrainingScene, Channel], Outcome]] = {
         "fit": _fit,
         "import": _import,
         "render": _render,
@@ -40,7 +42,7 @@ def carry_out(request_path: str) -> int:
     phase = phases[request.phase]
     try:
         method: Method | Importer = load_importer(request.importer) if request.importer else load_method(request.method)
-        outcome = phase(request, method, Scene.open(Path(request.scene)).training())
+        outcome = phase(request, method, Scene.open(Path(request.scene)).training(), channel)
     except Failure as failure:
         outcome = Outcome(status=failure.status, reason=failure.reason)
     except MemoryError as error:
@@ -54,7 +56,7 @@ def carry_out(request_path: str) -> int:
 
             traceback.print_exc()
             outcome = Outcome(status=Status.CRASHED, reason=_one_line(error))
-    write_model(Path(request.result), outcome)
+    channel.finish(outcome.model_dump(mode="json"))
     return 0
 
 
@@ -70,7 +72,7 @@ def _load_compiler() -> None:
         importlib.import_module("torch._dynamo")
 
 
-def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
+def _fit(request: Request, method: Method, scene: TrainingScene, channel: Channel) -> Outcome:
     config = method.Config.preset(request.preset, request.overrides)
     support = method.supports(scene)
     if not support.ok:
@@ -86,6 +88,7 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
             cache=Path(request.cache) if request.cache else None,
             _report=_reporter(stream),
         )
+        channel.mark(FIT_STARTS)
         start = time.perf_counter()
         if request.checkpoints:
             run._checkpoints = Checkpoints(
@@ -93,16 +96,16 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
                 request.marks,
                 lambda: run.fit_seconds(time.perf_counter() - start),
                 _synchronise,
+                channel.mark,
             )
         fitted = method.fit(scene, config, run)
         _synchronise()
-        seconds = run.fit_seconds(time.perf_counter() - start)
+        channel.mark(FIT_ENDS)
     fitted.save(Path(request.model))
-    taken = run._checkpoints
+    channel.mark(SAVED)
     return Outcome(
-        seconds=seconds,
-        checkpoints=taken.seconds if taken else [],
-        checkpoint_seconds=taken.spent if taken else None,
+        overhead_seconds=run._overhead_seconds,
+        checkpoints=run._checkpoints.seconds if run._checkpoints else [],
         reused=run.reused,
         stages=run.stages,
         notes=run.notes,
@@ -113,7 +116,7 @@ def _fit(request: Request, method: Method, scene: TrainingScene) -> Outcome:
     )
 
 
-def _import(request: Request, importer: Importer, scene: TrainingScene) -> Outcome:
+def _import(request: Request, importer: Importer, scene: TrainingScene, channel: Channel) -> Outcome:
     fitted = importer.read(Path(request.source), Path(request.export), scene)
     fitted.save(Path(request.model))
     return Outcome(peak_device_memory_bytes=_device_peak(), renderer=_renderers())
@@ -127,10 +130,11 @@ def _reporter(stream: TextIO) -> Callable[[float, str], None]:
     return report
 
 
-def _render(request: Request, method: Method | Importer, scene: TrainingScene) -> Outcome:
+def _render(request: Request, method: Method | Importer, scene: TrainingScene, channel: Channel) -> Outcome:
     fitted = method.load(Path(request.model), scene)
+    fitted.to_device(request.device)
     output = Path(request.output)
-    views = _views(request, scene)
+    views = requested_views(request, scene)
     counts = []
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         report = _reporter(stream)
@@ -157,15 +161,14 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene) -
         geometry.save(output / "geometry.npz")
     counted = [count for count in counts if count is not None]
     return Outcome(
-        render_fps=_frame_rate(fitted, scene, request.timing_frames),
-        timed_frames=request.timing_frames,
+        render_fps=_frame_rate(fitted, scene, request.timing_frames, channel),
         primitives_per_frame=statistics.fmean(counted) if counted else None,
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),
     )
 
 
-def _views(request: Request, scene: TrainingScene) -> list[tuple[Camera, int, float]]:
+def requested_views(request: Request, scene: TrainingScene) -> list[tuple[Camera, int, float]]:
     """What is rendered: camera, the timestep that its files are named by, and seconds."""
     if request.training_views is not None:
         pairs = [(scene.cameras[name], t) for name, steps in request.training_views.items() for t in steps]
@@ -179,7 +182,7 @@ def _time(scene: TrainingScene, camera: Camera, t: int) -> float:
     return float(scene.camera_times[camera.name][t])
 
 
-def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | None:
+def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int, channel: Channel) -> float | None:
     """Frames per second: median of at least `frames` synchronised renders after a warm-up, without I/O.
 
     Protocol v1 (docs/protocol.md, cost).
@@ -188,6 +191,7 @@ def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | No
         return None
     cameras = list(scene.test_cameras.values())
     seconds = []
+    channel.mark(TIMING_STARTS)
     for i in range(WARM_UP_FRAMES + frames):
         camera, t = cameras[i % len(cameras)], (i // len(cameras)) % scene.n_frames
         _synchronise()
@@ -196,13 +200,14 @@ def _frame_rate(fitted: Fitted, scene: TrainingScene, frames: int) -> float | No
         _synchronise()
         if i >= WARM_UP_FRAMES:
             seconds.append(time.perf_counter() - start)
+    channel.mark(TIMING_ENDS)
     return 1.0 / max(statistics.median(seconds), 1e-9)
 
 
 def _cuda() -> Any:
-    """torch.cuda where the method has loaded torch and uses a device; torch is never imported for this alone."""
+    """torch.cuda where the method uses a device; torch is never imported, nor a device woken, for this alone."""
     torch = sys.modules.get("torch")
-    return torch.cuda if torch is not None and torch.cuda.is_available() else None
+    return torch.cuda if torch is not None and torch.cuda.is_initialized() else None
 
 
 def _synchronise() -> None:

@@ -18,6 +18,7 @@ from splashbench.progress import track
 from splashbench.scene import Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Submission, seal, write_view
 from splashbench.submission.cameras import write_cameras
+from splashbench.submission.scene_files import write_scene_files
 from splashbench.version import __version__
 
 
@@ -55,5 +56,6 @@ def write_oracle(
         )
         count = float(particles.active.sum(axis=1).mean()) if particles is not None else None
         write_cameras(staging, scene)
+        write_scene_files(staging, scene)
         seal(staging, identity, Record(particles_per_frame=count))
     return Submission.open(out)

@@ -6,35 +6,34 @@ complete in every case: with renders when the run is `ok`, else with a status an
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from splashbench.child import child_command, raise_if_disk_was_full
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_directory, read_model, tree_bytes, write_model
-from splashbench.harness import hardware, method_process
+from splashbench.files import atomic_directory
+from splashbench.harness import estimates, hardware
 from splashbench.harness.contract import Method
+from splashbench.harness.devices import chosen_device
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
-from splashbench.harness.messages import Outcome, Request
+from splashbench.harness.leftovers import clear_leftovers, held, scratch_folder
+from splashbench.harness.messages import Request
+from splashbench.harness.phases import run_phases
 from splashbench.harness.training_copy import make_training_copy
-from splashbench.harness.watched_process import Watched, watch
-from splashbench.scene import Particles, Scene, SignedDistance
+from splashbench.scene import Scene, SignedDistance
 from splashbench.submission import (
     IDENTITY,
     Budget,
-    Checkpoint,
     Identity,
-    Record,
     Status,
     Submission,
     identity_text,
     seal,
 )
 from splashbench.submission.cameras import write_cameras
+from splashbench.submission.scene_files import write_scene_files
 from splashbench.submission.withheld import Withheld, kept_timesteps, scored_timesteps
 from splashbench.version import __version__
 
@@ -61,10 +60,12 @@ def run_method(
     checkpoints: Sequence[float] | None = None,
     budget: Budget | None = None,
     oracle_geometry: Callable[[Scene], SignedDistance | None] | None = None,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> Submission:
     """Run method `name` on the scene and write the submission `out`.
 
     Args:
+        device: "cpu", "cuda", or "auto", see `devices.chosen_device`.
         preset: a preset of the method; its first one (the default) when None.
         overrides: single settings on top of the preset.
         timeout_seconds: limit for the fit, and again for the rendering.
@@ -77,6 +78,7 @@ def run_method(
             `checkpoints.MARKS`.
         budget: what the fit may cost; only limits that the method keeps to (`Method.budgets`).
         oracle_geometry: for the control `oracle` alone, see `write_oracle`.
+        tell: is given lines for the user before the fit starts: what earlier runs left, and how long they took.
 
     Raises SplashbenchError for what is wrong before the method starts; a method that fails gives a status instead.
     """
@@ -98,9 +100,7 @@ def run_method(
 
         return write_oracle(scene, out, geometry=oracle_geometry, replace=replace)
     method = load_method(name)
-    if device not in method.devices:
-        devices = ", ".join(method.devices)
-        raise SplashbenchError(f"method {method.id} runs on {devices}, not on {device!r}; leave --device out")
+    device = chosen_device(method, device)
     _require_budgets(method, budget)
     preset = preset or next(iter(method.Config.presets))
     config = method.Config.preset(preset, overrides)
@@ -116,40 +116,47 @@ def run_method(
         scene_digest=scene.digest,
         withheld=withheld,
     )
+    kept = kept_timesteps(scene.n_frames, withheld)
+    for line in (*clear_leftovers(out), estimates.estimate(identity, scene, kept)):
+        tell(line)
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene_directory]) as staging,
-        tempfile.TemporaryDirectory() as scratch,
+        scratch_folder() as scratch,
     ):
-        record = _run_phases(
-            Path(scratch),
-            staging,
-            Request(
-                phase="fit",
-                method=name,
-                scene=str(make_training_copy(scene, Path(scratch, "scene"), kept_timesteps(scene.n_frames, withheld))),
-                preset=preset,
-                overrides=dict(overrides or {}),
-                seed=seed,
-                device=device,
-                budget_seconds=timeout_seconds,
-                scratch=str(_folder(Path(scratch, "scratch"))),
-                model=str(_folder(staging / "model")),
-                output=str(staging),
-                result=str(Path(scratch, "outcome.json")),
-                progress=str(Path(scratch, "progress")),
-                timing_frames=timing_frames,
-                exr=exr,
-                cache=str(cache.resolve()) if cache else None,
-                times={name: scene.camera_times[name].tolist() for name in scene.test} if withheld else None,
-                checkpoints=str(_folder(Path(scratch, "checkpoints"))) if checkpoints else None,
-                marks=list(checkpoints or ()),
-                budget=budget or Budget(),
-            ),
-        )
+        with held(staging):
+            record = run_phases(
+                scratch,
+                staging,
+                Request(
+                    phase="fit",
+                    method=name,
+                    scene=str(make_training_copy(scene, scratch / "scene", kept)),
+                    preset=preset,
+                    overrides=dict(overrides or {}),
+                    seed=seed,
+                    device=device,
+                    budget_seconds=timeout_seconds,
+                    scratch=str(_folder(scratch / "scratch")),
+                    model=str(_folder(staging / "model")),
+                    output=str(staging),
+                    progress=str(scratch / "progress"),
+                    timing_frames=timing_frames,
+                    exr=exr,
+                    cache=str(cache.resolve()) if cache else None,
+                    times={name: scene.camera_times[name].tolist() for name in scene.test} if withheld else None,
+                    checkpoints=str(_folder(scratch / "checkpoints")) if checkpoints else None,
+                    marks=list(checkpoints or ()),
+                    budget=budget or Budget(),
+                ),
+            )
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, method.id)
-        write_cameras(staging, scene, kept_timesteps(scene.n_frames, withheld))
+        write_cameras(staging, scene, kept)
+        if record.status == Status.OK:
+            write_scene_files(staging, scene)
         seal(staging, identity, record)
+    if record.status == Status.OK and record.fit_seconds is not None and cache is None:
+        estimates.note(identity, scene, kept, record.fit_seconds)
     return Submission.open(out)
 
 
@@ -173,7 +180,7 @@ def _identity(method: Method, **run: Any) -> Identity:
             control=method.control,
             mixed=method.mixed,
             splashbench_version=__version__,
-            hardware=hardware.describe(),
+            hardware=hardware.describe(run["device"]),
             **run,
         )
         identity_text(identity)
@@ -197,111 +204,6 @@ def require_unchanged(scene: Scene, method: str) -> None:
         raise SplashbenchError(
             f"{scene.directory} was changed while {method} ran, maybe by the method; restore it and run again"
         )
-
-
-def _run_phases(scratch: Path, staging: Path, request: Request) -> Record:
-    record = Record()
-    peak = 0
-    device_peak: int | None = None
-    seconds: list[float] = []
-    for phase in ("fit", "render"):
-        label = f"{request.method.rpartition('/')[2][:24]}: {phase}"
-        outcome, watched = run_phase(scratch, request.model_copy(update={"phase": phase}), label)
-        peak = max(peak, watched.peak_memory_bytes)
-        if outcome.peak_device_memory_bytes is not None:
-            device_peak = max(device_peak or 0, outcome.peak_device_memory_bytes)
-        used = sorted({*record.renderer, *outcome.renderer})
-        record = record.model_copy(
-            update={"peak_memory_bytes": peak, "peak_device_memory_bytes": device_peak, "renderer": used}
-        )
-        if outcome.status != Status.OK:
-            return record.model_copy(
-                update={"status": outcome.status, "reason": outcome.reason, "log_tail": watched.log_tail}
-            )
-        if phase == "fit":
-            static = tree_bytes(Path(request.model, "static"))
-            storage = tree_bytes(Path(request.model))
-            record = record.model_copy(
-                update={
-                    "fit_seconds": outcome.seconds,
-                    "reused": outcome.reused,
-                    "stages": outcome.stages,
-                    "notes": outcome.notes,
-                    "decisions": outcome.decisions,
-                    "checkpoint_seconds": outcome.checkpoint_seconds,
-                    "storage_bytes": storage,
-                    "dynamic_bytes": storage - static,
-                }
-            )
-            seconds = outcome.checkpoints
-    checkpoints = [_checkpoint(scratch, staging, request, k, of_fit) for k, of_fit in enumerate(seconds)]
-    return record.model_copy(
-        update={
-            "checkpoints": checkpoints,
-            "render_fps": outcome.render_fps,
-            "timed_frames": outcome.timed_frames,
-            "primitives_per_frame": outcome.primitives_per_frame,
-            "particles_per_frame": particles_per_frame(staging),
-        }
-    )
-
-
-def _checkpoint(scratch: Path, staging: Path, request: Request, number: int, seconds: float) -> Checkpoint:
-    """Render the test views by the state that the fit had after `seconds`; its model is removed then."""
-    name = f"{number:02d}"
-    model, folder = Path(str(request.checkpoints), name), f"checkpoints/{name}"
-    label = f"{request.method.rpartition('/')[2][:24]}: after {seconds:.0f} s"
-    changes = {"phase": "render", "model": str(model), "output": str(_folder(staging / folder)), "timing_frames": 0}
-    outcome, _ = run_phase(scratch, request.model_copy(update={**changes, "exr": False, "only_views": True}), label)
-    storage = tree_bytes(model)
-    dynamic = storage - tree_bytes(model / "static")
-    _remove_tree(model)
-    if outcome.status != Status.OK:
-        _remove_tree(staging / folder)
-    return Checkpoint(
-        seconds=seconds,
-        folder=folder,
-        status=outcome.status,
-        reason=outcome.reason,
-        storage_bytes=storage,
-        dynamic_bytes=dynamic,
-    )
-
-
-def particles_per_frame(staging: Path) -> float | None:
-    """Mean number of active particles in particles.npz, where there is one."""
-    path = staging / "particles.npz"
-    return float(Particles.load(path).active.sum(axis=1).mean()) if path.is_file() else None
-
-
-def run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Watched]:
-    """Carry out `request` in a child process. Where it left no outcome, its exit code and log give one."""
-    path, result, progress = scratch / "request.json", Path(request.result), Path(request.progress)
-    for stale in (result, progress):
-        stale.unlink(missing_ok=True)
-    write_model(path, request)
-    watched = watch(
-        child_command(method_process.carry_out, path),
-        log=scratch / "log",
-        progress=progress,
-        label=label,
-        timeout_seconds=request.budget_seconds,
-    )
-    raise_if_disk_was_full(watched.exit_code, watched.log_tail)
-    if watched.timed_out:
-        outcome = Outcome(status=Status.TIMEOUT, reason=f"the {request.phase} took over {request.budget_seconds:g} s")
-    elif result.is_file() and watched.exit_code == 0:
-        outcome = read_model(result, Outcome)
-    elif watched.exit_code == -9:
-        outcome = Outcome(
-            status=Status.OUT_OF_MEMORY, reason=f"the {request.phase} was killed (signal 9), as when memory runs out"
-        )
-    else:
-        last = watched.log_tail[-1] if watched.log_tail else "it said nothing"
-        outcome = Outcome(
-            status=Status.CRASHED, reason=f"the {request.phase} ended with exit code {watched.exit_code}: {last}"
-        )
-    return outcome, watched
 
 
 def without_nulls(settings: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from splashbench.harness.messages import Outcome, Request
-from splashbench.harness.runner import run_phase
+from splashbench.harness.phases import run_phase
 from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Scene
 from splashbench.submission import Submission
@@ -49,7 +49,6 @@ def render_training_views(
             scratch=folder,
             model=str(submission.directory / "model"),
             output=str(out),
-            result=str(scratch / "outcome.json"),
             progress=str(scratch / "progress"),
             timing_frames=0,
             exr=False,

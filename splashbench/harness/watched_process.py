@@ -1,18 +1,22 @@
 """Running one child process under observation: wall time, peak memory of its whole tree, progress, a deadline.
 
 However it ends, everything it started ends with it: its process group, and what left the group but inherited its mark.
+Where the process is a keeper (keeper.py), whatever that one's process leaves ends too, and the keeper's report is read.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
+import socket
 import subprocess
 import time
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from splashbench.progress import Bar
 
@@ -20,6 +24,8 @@ _POLL_SECONDS = 0.05
 _LOG_TAIL_LINES = 20
 _LOG_TAIL_BYTES = 20_000
 _SILENT_SECONDS = 1.0
+# For a keeper to end what its process left, before it is killed itself.
+_KEEPER_SECONDS = 8.0
 #: In the environment of everything that a watched process starts, with a value of its own for each.
 _MARK = "SPLASHBENCH_RUN"
 
@@ -31,6 +37,7 @@ class Watched:
     Attributes:
         exit_code: negative for a signal. timed_out: whether the deadline killed it.
         log_tail: the last lines of its log. strays: processes that had left its group; they were killed.
+        report: of a keeper, the fields of a `clock.Report`; None where it left none.
     """
 
     exit_code: int
@@ -39,6 +46,7 @@ class Watched:
     log_tail: list[str]
     seconds: float
     strays: list[str]
+    report: dict[str, Any] | None = None
 
 
 def watch(
@@ -50,6 +58,7 @@ def watch(
     timeout_seconds: float | None,
     show_log: bool = False,
     keep_bar: bool = True,
+    kept: bool = False,
 ) -> Watched:
     """Run `command` in a process group of its own until it ends or its time is up.
 
@@ -58,6 +67,7 @@ def watch(
         progress: the file whose lines "FRACTION MESSAGE", appended meanwhile, move the bar.
         show_log: show the log's last line while no such line comes.
         keep_bar: leave the bar on the terminal.
+        kept: whether `command` is a keeper, which takes the descriptor of a socket as its last argument.
 
     Memory is the sum of resident sizes over the process tree. It is looked at, and the time measured, every 50 ms.
     """
@@ -65,22 +75,26 @@ def watch(
     environment[_MARK] = mark = uuid.uuid4().hex
     # Idle OpenMP threads that spin take the renderer's cores: twice the time on two cores.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
-    with log.open("wb") as stream:
+    reports, theirs = socket.socketpair()
+    with log.open("wb") as stream, theirs:
         process = subprocess.Popen(
-            command,
+            [*command, str(theirs.fileno())] if kept else command,
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=subprocess.STDOUT,
             start_new_session=True,
             env=environment,
+            pass_fds=[theirs.fileno()] if kept else (),
         )
+    report = _ReportReader(reports)
     start, peak, timed_out = time.monotonic(), 0, False
     bar = Bar(label, keep_bar)
     reader = ProgressReader(progress)
     last_update, fraction = start, 0.0
     try:
         while process.poll() is None:
-            peak = max(peak, _tree_memory(process.pid))
+            peak = max(peak, _tree_memory(process.pid, kept))
+            report.read()
             for fraction, message in reader.new():
                 bar.update(fraction, message)
                 last_update = time.monotonic()
@@ -96,19 +110,55 @@ def watch(
             bar.update(fraction, message)
     finally:
         # Also when the user interrupts: a method may have started processes of its own.
+        if kept:
+            _ask_to_end(process)
         _kill_group(process)
         strays = _kill_marked(mark, process.pid)
         bar.close()
-    return Watched(process.wait(), timed_out, peak, _tail(log), seconds, strays)
+        told = report.close()
+    strays += told["strays"] if told else []
+    return Watched(process.wait(), timed_out, peak, _tail(log), seconds, strays, told)
 
 
-def _tree_memory(pid: int) -> int:
+class _ReportReader:
+    """Takes what a keeper reports as it comes, so that neither waits for the other."""
+
+    def __init__(self, line: socket.socket) -> None:
+        self._line, self._data = line, b""
+        line.setblocking(False)
+
+    def read(self) -> None:
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            while piece := self._line.recv(1 << 20):
+                self._data += piece
+
+    def close(self) -> dict[str, Any] | None:
+        """The whole report; None where there is none, since the keeper was killed or there was no keeper."""
+        self.read()
+        self._line.close()
+        try:
+            report: dict[str, Any] = json.loads(self._data)
+        except ValueError:
+            return None
+        return report
+
+
+def _ask_to_end(process: subprocess.Popen) -> None:
+    """Let a keeper that runs still end what it keeps, wherever that went, and then itself."""
+    if process.poll() is None:
+        process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=_KEEPER_SECONDS)
+
+
+def _tree_memory(pid: int, kept: bool) -> int:
+    """Resident bytes of the process and what it started; of a keeper, only of what it keeps."""
     import psutil
 
     total = 0
     try:
         root = psutil.Process(pid)
-        for process in [root, *root.children(recursive=True)]:
+        for process in [*([] if kept else [root]), *root.children(recursive=True)]:
             try:
                 total += process.memory_info().rss
             except psutil.Error:

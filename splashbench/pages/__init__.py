@@ -1,6 +1,7 @@
 """HTML pages that need nothing but themselves: templates, one style, and what is embedded.
 
-A page is a template that extends `page.html.j2`. All text is escaped; data for scripts goes in by `as_json`.
+A page is a template that extends `page.html.j2`. All text is escaped; data for scripts goes in by `as_json`. The filter
+`plain` makes one line without control characters of a stranger's text, such as those that turn its direction around.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
+
+from splashbench.errors import one_line
 
 _HERE = Path(__file__).parent
 
@@ -27,6 +30,7 @@ def render(folder: Path, template: str, **content: Any) -> str:
         keep_trailing_newline=True,
     )
     environment.globals.update(embedded=embedded, as_json=as_json)
+    environment.filters["plain"] = one_line
     return environment.get_template(template).render(folder=folder, pages=_HERE, **content)
 
 

@@ -110,7 +110,7 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
     names, timesteps = session.cameras, options.timesteps or session.timesteps
     rig, pour = RigRecordings(session), PourRecordings(session)
     mesh = None if session.container_mesh is None else read_mesh(session.container_mesh)
-    _check_what_later_stages_need(session, options, pour, mesh)
+    _check_what_later_stages_need(session, options, pour, rig, mesh)
 
     # The cheap stages that most often find a fault come first.
     synced = audio.sync_stage(store, pour, session.reference)
@@ -123,25 +123,30 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
     lenses = {camera: result.lens for camera, result in calibrations.items()}
     rig.check_sizes(lenses, pour.recordings)
     undistorters = {camera: Undistorter(lens) for camera, lens in lenses.items()}
-    posed = poses.posed_rig(store, rig, lenses)
-    container_masks = containers.container_masks(session.container_folder, undistorters)
-    frame = poses.metric_frame(
-        store,
-        rig,
-        posed,
-        facts_of(containers.container_files(session)),
-        lambda: _upright_container(session, mesh, posed, lenses, container_masks, undistorters),
-    )
+    still = poses.stillness(store, rig, pour, clocks, interval.interval)
+    gates = [
+        *g.intrinsics_gates(calibrations),
+        *g.sync_gates(clocks, sequence),
+        *g.stillness_gates(still, lenses[names[0]].width),
+    ]
+    # The poses cost minutes and may fail for a reason that these gates know.
+    with g.told_with(gates):
+        posed = poses.posed_rig(store, rig, calibrations)
+        container_masks = containers.container_masks(session.container_folder, undistorters)
+        frame = poses.metric_frame(
+            store,
+            rig,
+            posed,
+            facts_of(containers.container_files(session)),
+            lambda: _upright_container(session, mesh, posed, lenses, container_masks, undistorters),
+        )
     scene_poses = metric.transformed(posed.poses, frame.scene_from_sfm)
     cameras = pinhole_cameras(lenses, scene_poses.w2c)
-
     paths = audio.sound_paths(session, cameras)
     if paths.applied:
         clocks = sync.shifted(clocks, paths.shift_s)
         sampled = video.sampled_frames(store, pour, clocks, interval, timesteps, "sampling")
-    gates = [
-        *g.intrinsics_gates(calibrations),
-        *g.sync_gates(clocks, sequence),
+    gates += [
         *g.pose_gates(scene_poses, names, lenses[names[0]].width),
         *g.metric_gates(frame),
         *g.sampling_gates(sampled),
@@ -185,6 +190,7 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
         sequence=sequence,
         poses=scene_poses,
         metric=frame,
+        stillness=still,
         motion=interval,
         sampling=sampled,
         masks=record,
@@ -198,9 +204,15 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
 
 
 def _check_what_later_stages_need(
-    session: Session, options: PrepareOptions, pour: PourRecordings, mesh: ContainerMesh | None
+    session: Session,
+    options: PrepareOptions,
+    pour: PourRecordings,
+    rig: RigRecordings,
+    mesh: ContainerMesh | None,
 ) -> None:
     """Report at once what can be seen at once, not after the hours of the stages before."""
+    for recording in [*pour.recordings.values(), *rig.videos()]:
+        recording.check()
     if mesh is not None:
         videos = {camera: probe(recording.paths[0]) for camera, recording in pour.recordings.items()}
         containers.check_masks(session, {name: (info.width, info.height) for name, info in videos.items()})

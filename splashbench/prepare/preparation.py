@@ -15,6 +15,7 @@ from splashbench.prepare.crop import PixelBox
 from splashbench.prepare.gates import Gate
 from splashbench.prepare.masks.session_masks import MaskRecord
 from splashbench.prepare.poses.scale import SceneFrame
+from splashbench.prepare.poses.stillness import Stillness
 from splashbench.prepare.poses.structure_from_motion import Poses
 from splashbench.prepare.scene_output import ReportPictures
 from splashbench.prepare.session import Session
@@ -46,6 +47,7 @@ class Preparation:
     sequence: SequenceSync
     poses: Poses
     metric: SceneFrame
+    stillness: dict[str, Stillness]
     motion: MotionInterval
     sampling: Sampling
     masks: MaskRecord
@@ -82,6 +84,8 @@ class Preparation:
                     "w2c": matrix.tolist(),
                     "centre_sigma_m": self.poses.centre_sigma.get(camera),
                     "rotation_sigma_deg": self.poses.rotation_sigma_deg.get(camera),
+                    "centre_sigma_of_features_m": self.poses.feature_centre_sigma.get(camera),
+                    "rotation_sigma_of_features_deg": self.poses.feature_rotation_sigma_deg.get(camera),
                 }
                 for camera, matrix in self.poses.w2c.items()
             },
@@ -107,6 +111,13 @@ class Preparation:
                     for name, seen in self.metric.prints.items()
                 },
                 "frame": "metres, +y up; origin at the middle of the print, +x along it",
+            },
+            "stillness": {
+                camera: {
+                    instant: {"shift_px": shift.px, "features": shift.agreeing, "matched": shift.matched}
+                    for instant, shift in seen.items()
+                }
+                for camera, seen in self.stillness.items()
             },
             "motion": {
                 "start_s": self.motion.start,
@@ -166,6 +177,7 @@ def _recording(video: VideoInfo) -> dict[str, Any]:
         "seconds": video.duration,
         "codec": video.codec,
         "timecode": video.timecode,
+        "created": video.created,
         "audio_minus_video_s": video.audio_minus_video_s,
     }
 

@@ -1,7 +1,8 @@
 """The raw session on disk: which camera recorded what, as its owner wrote it down in session.toml.
 
 A session is one sitting with fixed cameras (paper Sec. 3, "Capture and calibration"). Each camera has a clip of the
-calibration board, a recording of the textured static scene and one of the pour. A handheld sweep is optional. Cameras
+calibration board, a recording of the textured static scene and one of the pour. A handheld sweep is optional; so is a
+recording of the board carried about where several cameras see it at once, which then places the cameras. Cameras
 split long recordings into chapters, which are listed in order. All but the pour may be photographs instead of video: a
 folder of them stands for a chapter.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
@@ -30,7 +31,7 @@ from splashbench.prepare.session_tables import (
 )
 
 DESCRIPTION = "session.toml"
-Kind = Literal["pour", "static", "intrinsics"]
+Kind = Literal["pour", "static", "intrinsics", "extrinsics"]
 _CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
@@ -80,7 +81,7 @@ class Session(SessionTable):
             raise ValueError(f"[masks.points] names camera {clicked[0]}, which `cameras` does not list")
         if sorted(self.train + self.test) != sorted(self.cameras):
             raise ValueError("train and test must name every one of `cameras` exactly once between them")
-        for kind in ("pour", "static", "intrinsics"):
+        for kind in get_args(Kind):
             listed: dict[str, list[str]] = getattr(self.recordings, kind)
             if not listed and kind != "pour":
                 continue
@@ -96,6 +97,8 @@ class Session(SessionTable):
                 raise ValueError(f"[distance] names camera {unknown[0]}, which `cameras` does not list")
             if len(set(self.distance.cameras)) < 2:
                 raise ValueError("[distance] must name two different cameras")
+        if self.recordings.extrinsics and self.sweep is not None:
+            raise ValueError("[recordings.extrinsics] places the cameras by the board; leave out that or [sweep]")
         if self.recordings.intrinsics and self.board is None:
             raise ValueError("[recordings.intrinsics] needs the [board] that was filmed; describe it")
         return self
@@ -123,9 +126,14 @@ class Session(SessionTable):
         if not directory.is_dir():
             raise SplashbenchError(f"{directory} is not a folder; give the session's folder")
         path = directory / DESCRIPTION
+        if not path.exists():
+            raise SplashbenchError(
+                f"{path} does not exist; `splashbench prepare {directory} --init` writes it by looking at the"
+                " recordings"
+            )
         session = validate_model(path, cls, toml.load(path))
         session._directory = directory
-        for kind in ("pour", "static", "intrinsics"):
+        for kind in get_args(Kind):
             camera_of: dict[Path, str] = {}
             for camera, chapters in getattr(session.recordings, kind).items():
                 for chapter in chapters:

@@ -52,12 +52,14 @@ class Board(SessionTable):
 class Recordings(SessionTable):
     """Per kind of recording: camera name -> its chapters in order, relative to the session's folder.
 
-    A chapter of `static` or `intrinsics` may be a folder of photographs.
+    A chapter of `static`, `intrinsics` or `extrinsics` may be a folder of photographs. With `extrinsics` the cameras
+    are placed by the board, which several of them see at once; without, by structure from motion of the static scene.
     """
 
     pour: dict[str, Chapters]
     static: dict[str, Chapters] = Field(default_factory=dict)
     intrinsics: dict[str, Chapters] = Field(default_factory=dict)
+    extrinsics: dict[str, Chapters] = Field(default_factory=dict)
 
 
 class Sweep(SessionTable):

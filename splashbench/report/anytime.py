@@ -31,6 +31,8 @@ from splashbench.statistics import (
 QUALITY = ("psnr", "lpips", "miou")
 #: Seconds of which the page says which method is best.
 BUDGETS = (10.0, 60.0, 300.0)
+#: Entries of a group that have curves and are compared two by two.
+MAX_DRAWN = 30
 _REFERENCE = "nothing"
 _PER_OCTAVE = 4
 #: Ideal and reference of the hypervolume's dimensions: minutes of fit, LPIPS, megabytes (docs/protocol.md).
@@ -52,8 +54,7 @@ def trajectory(result: Result, name: str, failed_after: float) -> Trajectory | N
 
 def trajectories(group: Group, entry: Entry, name: str) -> dict[tuple[str, int], Trajectory]:
     """By (scene's digest, seed). A failed run is charged the longest fit of its group, as nobody knows its own."""
-    longest = max((r.value("fit_seconds") or 0.0 for e in group.entries for r in e.results), default=0.0)
-    found = {(r.digests.scene, r.seed): trajectory(r, name, longest) for r in entry.results}
+    found = {(r.digests.scene, r.seed): trajectory(r, name, group.longest_fit_seconds) for r in entry.results}
     return {key: run for key, run in found.items() if run is not None}
 
 
@@ -105,10 +106,27 @@ def grid(group: Group) -> NDArray[np.float64]:
     return np.geomspace(low, high, count)
 
 
+def foremost(group: Group, name: str, most: int = MAX_DRAWN) -> list[Entry]:
+    """The `most` entries with the best mean of metric `name` over their runs, in the group's order; all, where fewer.
+
+    It bounds what grows with the square of the entries, or is drawn for each.
+    """
+    if len(group.entries) <= most:
+        return group.entries
+    sign = -1.0 if METRICS[name].better == "higher" else 1.0
+
+    def place(entry: Entry) -> tuple[float, str]:
+        values = [value for result in entry.results if (value := result.value(name)) is not None]
+        return (sign * float(np.mean(values)) if values else float("inf"), entry.label)
+
+    chosen = {id(entry) for entry in sorted(group.entries, key=place)[:most]}
+    return [entry for entry in group.entries if id(entry) in chosen]
+
+
 def curves(group: Group, name: str) -> list[Curve]:
-    """A curve per entry that has metric `name`."""
+    """A curve per entry that has metric `name`, of the `foremost` ones."""
     nothing, steps, found = before(group, name), grid(group), []
-    for entry in group.entries:
+    for entry in foremost(group, name):
         runs = trajectories(group, entry, name)
         # Of an entry that lacks the figure in some runs the rest would be over other scenes.
         if len(runs) < len(entry.results) or not any(run.seconds for run in runs.values()):
@@ -169,9 +187,9 @@ class Chase:
 
 
 def chases(group: Group, name: str) -> list[Chase]:
-    """Every entry after every other one's final value, scene by scene, by its expected running time."""
+    """Each of the `foremost` entries after every other one's final value, by scene and expected running time."""
     higher = METRICS[name].better == "higher"
-    runs = {entry.label: trajectories(group, entry, name) for entry in group.entries}
+    runs = {entry.label: trajectories(group, entry, name) for entry in foremost(group, name)}
     found = []
     for target, label in itertools.permutations(runs, 2):
         ratios, reached, total = [], 0, 0

@@ -28,12 +28,19 @@ def changes(before: str, after: str) -> list[str]:
     gone, came, changed = [], [], []
     for key in [*old, *(key for key in new if key not in old)]:
         was, now = list(old.get(key, [])), list(new.get(key, []))
-        pairs = [(a, b) for a in was for b in now if a.get("settings_digest") == b.get("settings_digest")]
-        for a, b in pairs:
-            if a in was and b in now:
-                was.remove(a)
-                now.remove(b)
+        partners: dict[str | None, list[dict[str, str]]] = {}
+        for b in now:
+            partners.setdefault(b.get("settings_digest"), []).append(b)
+        alone, taken = [], set()
+        for a in was:
+            same = partners.get(a.get("settings_digest"))
+            if same:
+                b = same.pop(0)
+                taken.add(id(b))
                 changed += _differences(_name(key), a, b)
+            else:
+                alone.append(a)
+        was, now = alone, [b for b in now if id(b) not in taken]
         for a, b in zip(was, now):
             changed += _differences(_name(key), a, b)
         gone += [f"gone: {_name(key)}" for _ in was[len(now) :]]

@@ -5,7 +5,9 @@ PNG and SVG; the bytes depend on the results alone. speed_accuracy.py computes w
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -27,6 +29,8 @@ GREY = "#666666"
 _ORACLE = "oracle"
 _GIB = 2.0**30
 _MIN_AREA, _MAX_AREA = 30.0, 420.0
+#: Rows of panels, methods in each, and kinds of failures written into a panel, at most.
+_MAX_ROWS, _MAX_METHODS, _MAX_FAILURES = 8, 24, 12
 _TICKS = tuple((n * unit, f"{n} {name}") for unit, name in ((1, "s"), (60, "min"), (3600, "h")) for n in (1, 3, 10, 30))
 #: Of every chart of a report, for matplotlib.rc_context.
 STYLE: dict[str, Any] = {
@@ -52,7 +56,9 @@ def speed_accuracy_chart(sources: Sequence[ResultFile], out: Path, with_paper: b
     import matplotlib
     from matplotlib.figure import Figure
 
-    rows = machines(sources) + ([reported_machine()] if with_paper else [])
+    measured = machines(sources)
+    rows, note = _drawn(measured)
+    rows += [reported_machine()] if with_paper else []
     methods = sorted({entry.label for row in rows for entry in row.entries})
     looks = {
         label: (COLOURS[i % len(COLOURS)], _SHAPES[(i + i // len(COLOURS)) % len(_SHAPES)])
@@ -67,11 +73,40 @@ def speed_accuracy_chart(sources: Sequence[ResultFile], out: Path, with_paper: b
             _panel(right, row, row.quality_name(), looks, largest)
             left.set_title(row.title)
         figure.suptitle("Speed against accuracy, test views", x=0.01, ha="left", fontsize=12, fontweight="bold")
+        if note:
+            figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color=GREY)
         _legend(figure, looks, largest, any(row.reported for row in rows), _filtered(rows))
         paths = [Path(out, "speed_accuracy.png"), Path(out, "speed_accuracy.svg")]
         for path in paths:
             save_figure(figure, path)
     return paths
+
+
+def _drawn(rows: list[Machine]) -> tuple[list[Machine], str]:
+    """The rows with the most runs, of each the methods on most scenes; and what is left out, in words.
+
+    A picture of sixty machines or of three thousand methods shows nothing, and takes minutes to draw.
+    """
+
+    def runs(row: Machine) -> int:
+        return sum(len(entry.dots) for entry in row.entries) + sum(row.failures.values())
+
+    chosen = {id(row) for row in sorted(rows, key=lambda row: (-runs(row), row.title))[:_MAX_ROWS]}
+    kept = [row for row in rows if id(row) in chosen]
+    methods = 0
+    for n, row in enumerate(kept):
+        first = sorted(row.entries, key=lambda entry: (-len(entry.scenes), -len(entry.dots), entry.label))
+        methods += max(0, len(first) - _MAX_METHODS)
+        names = {entry.label for entry in first[:_MAX_METHODS]}
+        failures = Counter(dict(sorted(row.failures.items(), key=lambda item: (-item[1], item[0]))[:_MAX_FAILURES]))
+        others = sum(row.failures.values()) - sum(failures.values())
+        if others:
+            failures["other failed runs"] = others
+        entries = [entry for entry in row.entries if entry.label in names]
+        kept[n] = replace(row, entries=entries, failures=failures)
+    left = [f"{len(rows) - len(kept)} more machines"] if len(rows) > len(kept) else []
+    left += [f"{methods} more methods"] if methods else []
+    return kept, f"Not drawn, but in the tables: {' and '.join(left)}." if left else ""
 
 
 def save_figure(figure: Figure, path: Path) -> None:

@@ -5,12 +5,18 @@ Figures of two groups never share a chart or a mean: they would compare machines
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
+from splashbench.errors import one_line
 from splashbench.report.results import ResultFile
 from splashbench.score.result import Result
+
+_MAX_TOLD = 300
+# Different sets of scenes whose intersections `comparable` tries; the work grows with their square.
+_MAX_SETS = 40
 
 
 @dataclass
@@ -45,9 +51,14 @@ class Group:
     def scenes(self) -> dict[str, str]:
         """Digest to name of every scene, in the order of names; those of one name are told apart by their digests."""
         found = {r.digests.scene: r.scene for entry in [*self.entries, *self.controls] for r in entry.results}
-        names = list(found.values())
-        shown = {d: name if names.count(name) == 1 else f"{name} {d[:8]}" for d, name in found.items()}
+        count = Counter(found.values())
+        shown = {d: name if count[name] == 1 else f"{name} {d[:8]}" for d, name in found.items()}
         return dict(sorted(shown.items(), key=lambda item: item[1]))
+
+    @cached_property
+    def longest_fit_seconds(self) -> float:
+        """The longest fit of its entries, 0 where none was timed. Ask only once all entries are in."""
+        return max((r.value("fit_seconds") or 0.0 for entry in self.entries for r in entry.results), default=0.0)
 
     @property
     def told_text(self) -> str:
@@ -59,7 +70,7 @@ def told_text(told: tuple[str, ...] | None) -> str:
     """`Result.told` in words."""
     if told is None:
         return "not noted"
-    return ", ".join(told) or "nothing"
+    return one_line(", ".join(told))[:_MAX_TOLD] or "nothing"
 
 
 def groups(sources: Sequence[ResultFile]) -> list[Group]:
@@ -91,28 +102,30 @@ def entry_key(result: Result) -> tuple[str, str, str]:
 def labels(results: Iterable[Result]) -> dict[tuple[str, str, str], str]:
     """Method, with the preset where it has several, and the settings' digest where a preset has several."""
     keys = {entry_key(result) for result in results}
+    presets = Counter(method for method, _ in {key[:2] for key in keys})
+    twins = Counter(key[:2] for key in keys)
     found = {}
     for method, preset, digest in keys:
-        presets = {key[1] for key in keys if key[0] == method}
-        twins = {key for key in keys if key[:2] == (method, preset)}
-        label = method if len(presets) == 1 else f"{method} [{preset}]"
-        found[method, preset, digest] = label if len(twins) == 1 else f"{label} {digest}"
-    taken = list(found.values())
+        label = method if presets[method] == 1 else f"{method} [{preset}]"
+        found[method, preset, digest] = label if twins[method, preset] == 1 else f"{label} {digest}"
+    taken = Counter(found.values())
     # A method may be called what another one is labelled.
-    return {key: label if taken.count(label) == 1 else f"{label} {key[2]}" for key, label in found.items()}
+    return {key: label if taken[label] == 1 else f"{label} {key[2]}" for key, label in found.items()}
 
 
 def comparable(group: Group) -> Group:
     """The part of `group` in which every entry ran on every scene: means over other scenes could not be compared.
 
     The scenes are those of one entry, or common to two, for which the number of entries that ran on all of them times
-    the number of scenes is largest. Controls are kept.
+    the number of scenes is largest. Of more than `_MAX_SETS` sets of scenes, those of the most entries are considered.
+    Controls are kept.
     """
-    sets = [entry.scenes for entry in group.entries]
-    candidates = {frozenset(a & b) for a in sets for b in sets}
+    sets = Counter(frozenset(entry.scenes) for entry in group.entries)
+    common = [scenes for scenes, _ in sorted(sets.items(), key=lambda item: (-item[1], sorted(item[0])))[:_MAX_SETS]]
+    candidates = {a & b for a in common for b in common}
 
     def worth(scenes: frozenset[str]) -> tuple[int, int, list[str]]:
-        count = sum(scenes <= entry.scenes for entry in group.entries) if scenes else 0
+        count = sum(entries for other, entries in sets.items() if scenes <= other) if scenes else 0
         return count * len(scenes), count, sorted(scenes)
 
     chosen = max(candidates, key=worth, default=frozenset())

@@ -12,6 +12,13 @@ from splashbench.score.notation import label, shown
 _FIGURES = [METRICS[name] for name in ("psnr", "ssim", "lpips", "jitter_error")]
 
 
+def has_reported_figures(scene: str) -> bool:
+    """Whether the paper prints figures of this very scene."""
+    from splashbench.paper_figures import paper_rows
+
+    return any(row["scene_set"] == scene.lower() for row in paper_rows())
+
+
 def reported_table(scene: str) -> list[str]:
     """A line of introduction and the table, in Markdown; nothing for a scene of which the paper prints nothing.
 

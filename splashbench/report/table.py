@@ -11,11 +11,13 @@ from typing import Any
 
 import pandas as pd
 
+from splashbench.csv_cells import csv_text
 from splashbench.report.groups import told_text
 from splashbench.report.results import ResultFile
 from splashbench.score.metrics import METRICS, TRUTH_METRICS
 from splashbench.score.notation import stored
 from splashbench.score.result import Result
+from splashbench.score.verification import Verification
 
 _FIGURES = tuple(name for name in METRICS if name not in TRUTH_METRICS)
 _SPREAD = tuple(name for name in _FIGURES if METRICS[name].group != "cost" or name == "fit_seconds")
@@ -27,6 +29,13 @@ CSV_COLUMNS = (
     *("method_version", "settings_digest", "protocol", "scene_digest", "hardware"),
     *TRUTH_METRICS,
     *(f"{name}_spread" for name in TRUTH_METRICS),
+)
+#: Of a leaderboard whose results were scored again.
+VERIFIED_COLUMNS = ("verified", "stated_otherwise")
+# Text of a CSV: what strangers wrote, and what is made of it.
+_TEXT_COLUMNS = (
+    *("method", "scene", "seed", "preset", "status", "reason", "method_version", "settings_digest", "protocol"),
+    *("scene_digest", "hardware", *VERIFIED_COLUMNS),
 )
 #: What rows must share to stand in one table of the Markdown: scene, its exact bytes, and protocol.
 SCENE_COLUMNS = ["scene", "scene_digest", "protocol"]
@@ -42,8 +51,9 @@ def leaderboard_table(sources: Sequence[ResultFile]) -> pd.DataFrame:
 
     Columns: those of the CSV, with figures as floats and NaN for none; every metric has its spread, NaN for one run.
     `failed` says whether a row is a failed run, and `results` holds the row's results in the order of their seeds.
+    `verified` and `stated_otherwise` say in words what scoring the submissions again gave; "" where nobody asked.
     """
-    runs = pd.DataFrame([_run(source.result) for source in sources])
+    runs = pd.DataFrame([{**_run(source.result), "verification": source.verification} for source in sources])
     names = list(METRICS)
     runs[names] = runs[names].astype(float)
     groups = runs.sort_values(["seed", "submission"]).groupby(_ROW_COLUMNS, sort=False)
@@ -53,12 +63,19 @@ def leaderboard_table(sources: Sequence[ResultFile]) -> pd.DataFrame:
         .first()
         .join(
             [
-                groups.agg(seed=("seed", _joined), runs=("seed", "size"), results=("result", list)),
+                groups.agg(
+                    seed=("seed", _joined),
+                    runs=("seed", "size"),
+                    results=("result", list),
+                    verifications=("verification", list),
+                ),
                 figures.median(),
                 (figures.max() - figures.min()).where(figures.count() > 1).add_suffix("_spread"),
             ]
         )
     )
+    rows["verified"] = rows["verifications"].map(_verdict)
+    rows["stated_otherwise"] = rows["verifications"].map(_stated_otherwise)
     ranking = [*SCENE_COLUMNS, "failed", "lpips", "psnr", *METHOD_COLUMNS, "told", "failed_submission"]
     ascending = [column != "psnr" for column in ranking]
     return rows.reset_index().sort_values(ranking, ascending=ascending, ignore_index=True)
@@ -89,6 +106,19 @@ def _run(result: Result) -> dict[str, Any]:
     }
 
 
+def _verdict(verifications: Sequence[Verification | None]) -> str:
+    """One word for a row: the same verdict for all of its runs, or how many of them have which."""
+    verdicts = [verification.verdict for verification in verifications if verification is not None]
+    if len(set(verdicts)) <= 1:
+        return verdicts[0] if verdicts else ""
+    return ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in sorted(set(verdicts)))
+
+
+def _stated_otherwise(verifications: Sequence[Verification | None]) -> str:
+    found = dict.fromkeys(str(different) for each in verifications if each for different in each.differences)
+    return "; ".join(found)
+
+
 def _joined(seeds: pd.Series) -> str:
     return " ".join(map(str, seeds))
 
@@ -101,4 +131,7 @@ def to_csv(table: pd.DataFrame) -> str:
             text[column] = [stored(name, value) for value in table[column]]
     for column in ("control", "mixed"):
         text[column] = table[column].map({True: "true", False: "false"})
-    return str(text.to_csv(columns=list(CSV_COLUMNS), index=False, lineterminator="\n"))
+    for column in _TEXT_COLUMNS:
+        text[column] = table[column].map(csv_text)
+    columns = [*CSV_COLUMNS, *(VERIFIED_COLUMNS if (table["verified"] != "").any() else ())]
+    return str(text.to_csv(columns=columns, index=False, lineterminator="\n"))

@@ -7,13 +7,14 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from splashbench.markdown import bullets, one_line
+from splashbench.markdown import bullets, escaped
 from splashbench.markdown import table as markdown_table
 from splashbench.report.reported import reported_table
-from splashbench.report.results import ResultFile
+from splashbench.report.results import LeftOut, ResultFile, claimed_text
 from splashbench.report.table import METHOD_COLUMNS, SCENE_COLUMNS
 from splashbench.score.metrics import METRICS, TRUTH_METRICS
 from splashbench.score.notation import FILTER_NOTE, filter_mark, label, shown, stored
+from splashbench.score.result import Result
 
 _QUALITY = (
     *("psnr", "dpsnr_bg", "ssim", "ssim_fg", "lpips", "miou", "spill", "spill_rgb", "jitter_error"),
@@ -21,10 +22,20 @@ _QUALITY = (
 )
 _COST = ("fit_seconds", "render_fps", "peak_memory_bytes", "storage_bytes")
 _NOT_RANKED = ("sigma_d", "mu_d")
+#: Claims of one run, and lines of a list, at most; the rest is counted.
+_MAX_CLAIMS, _MAX_LINES = 20, 500
 
 
-def to_markdown(table: pd.DataFrame, sources: Sequence[ResultFile], with_paper: bool = False) -> str:
-    """The whole document. `table`: from `leaderboard_table`; `with_paper`: tables of the paper's own figures."""
+def to_markdown(
+    table: pd.DataFrame, sources: Sequence[ResultFile], with_paper: bool = False, left_out: Sequence[LeftOut] = ()
+) -> str:
+    """The whole document.
+
+    Args:
+        table: from `leaderboard_table`.
+        with_paper: tables of the paper's own figures.
+        left_out: files that could not be used, which are named.
+    """
     letters = {machine: _letter(i) for i, machine in enumerate(sorted(set(table["hardware"])))}
     parts = [
         "# Leaderboard",
@@ -34,13 +45,24 @@ def to_markdown(table: pd.DataFrame, sources: Sequence[ResultFile], with_paper: 
     ]
     if table["mixed"].any():
         parts.append(FILTER_NOTE)
+    if left_out:
+        parts.append(
+            f"Files that are in no table: {len(left_out)} of {len(sources) + len(left_out)}, named at the end."
+        )
+    if (table["verified"] != "").any():
+        parts.append(
+            "Verified: scored again from the submission, by `--verify`. Where a result states another figure, the cell "
+            "has the verified one, and the one that was claimed behind it."
+        )
     for (scene, digest, protocol), rows in table.groupby(SCENE_COLUMNS, sort=False):
-        parts += [f"## {scene} (protocol {protocol}, scene {digest[:8]})", _scene_table(rows, letters)]
+        title = f"## {escaped(scene)} (protocol {escaped(protocol)}, scene {_digest(digest, 8)})"
+        parts += [title, _scene_table(rows, letters)]
         parts += _truth_table(rows)
         parts += reported_table(scene) if with_paper else []
     parts += _means(table, letters)
-    parts += ["## Hardware", bullets(f"{letter}: {one_line(machine)}" for machine, letter in letters.items())]
+    parts += ["## Hardware", bullets(f"{letter}: {escaped(machine)}" for machine, letter in letters.items())]
     parts += _failures(table) + _claims(table) + _missing(table)
+    parts += _left_out(left_out)
     parts += ["## Sources", _sources(sources)]
     return "\n\n".join(parts) + "\n"
 
@@ -51,9 +73,12 @@ def _letter(index: int) -> str:
 
 def _scene_table(rows: pd.DataFrame, letters: dict[str, str]) -> str:
     figures = {name: _quality_cells(rows, name) for name in _QUALITY if rows[name].notna().any()}
-    figures |= {name: [shown(METRICS[name], value) for value in rows[name]] for name in _COST}
+    figures |= {name: _cost_cells(rows, name) for name in _COST}
+    names = {"Method": _methods(rows), "Preset": _presets(rows), "Seeds": rows["seed"], "Status": rows["status"]}
+    if (rows["verified"] != "").any():
+        names["Verified"] = rows["verified"]
     return _table(
-        {"Method": _methods(rows), "Preset": _presets(rows), "Seeds": rows["seed"], "Status": rows["status"]},
+        names,
         figures,
         {"Hardware": rows["hardware"].map(letters)},
     )
@@ -84,13 +109,15 @@ def _table(
 
 def _methods(rows: pd.DataFrame) -> pd.Series:
     """Names of the methods; controls in italics."""
-    return rows["method"].where(~rows["control"], "*" + rows["method"] + "*")
+    names = rows["method"].map(escaped)
+    return names.where(~rows["control"], "*" + names + "*")
 
 
 def _presets(rows: pd.DataFrame) -> pd.Series:
     """Presets, with the settings' digest where two rows would look the same without it."""
     alike = rows.groupby(["method", "preset"])["settings_digest"].transform("nunique") > 1
-    return rows["preset"].where(~alike, rows["preset"] + " (" + rows["settings_digest"] + ")")
+    names = rows["preset"].map(escaped)
+    return names.where(~alike, names + " (" + rows["settings_digest"] + ")")
 
 
 def _best(rows: pd.DataFrame, name: str) -> float | None:
@@ -107,13 +134,28 @@ def _quality_cells(rows: pd.DataFrame, name: str) -> list[str]:
     """Median ± half the spread, the best in bold."""
     best, metric = _best(rows, name), METRICS[name]
     cells = []
-    for value, spread, control, mixed in zip(rows[name], rows[f"{name}_spread"], rows["control"], rows["mixed"]):
+    for value, spread, control, mixed, verifications in zip(
+        rows[name], rows[f"{name}_spread"], rows["control"], rows["mixed"], rows["verifications"]
+    ):
         text = shown(metric, value)
         if value == best and not control:
             text = f"**{text}**"
         text += filter_mark(metric, mixed, value)
-        cells.append(text if pd.isna(spread) else f"{text} ± {shown(metric, spread / 2)}")
+        text = text if pd.isna(spread) else f"{text} ± {shown(metric, spread / 2)}"
+        cells.append(text + claimed_text(name, verifications))
     return cells
+
+
+def _cost_cells(rows: pd.DataFrame, name: str) -> list[str]:
+    return [
+        shown(METRICS[name], value) + claimed_text(name, verifications)
+        for value, verifications in zip(rows[name], rows["verifications"])
+    ]
+
+
+def _digest(text: str, length: int) -> str:
+    """The first letters of a digest, which a stranger's file may call anything."""
+    return "".join(letter if letter.isalnum() else "?" for letter in text[:length])
 
 
 def _means(table: pd.DataFrame, letters: dict[str, str]) -> list[str]:
@@ -123,7 +165,7 @@ def _means(table: pd.DataFrame, letters: dict[str, str]) -> list[str]:
         n_scenes = rows["scene_digest"].nunique()
         if n_scenes > 1:
             parts += [
-                f"## Mean over {n_scenes} scenes (protocol {protocol})",
+                f"## Mean over {n_scenes} scenes (protocol {escaped(protocol)})",
                 "Only for methods with a score, and no failed run, on every scene.",
                 _mean_table(rows, n_scenes, letters),
             ]
@@ -136,12 +178,13 @@ def _mean_table(rows: pd.DataFrame, n_scenes: int, letters: dict[str, str]) -> s
     scored = rows["scene_digest"].where(~rows["failed"]).groupby([rows[c] for c in METHOD_COLUMNS]).nunique()
     complete = (scored == n_scenes) & ~groups["failed"].any()
     # A figure that one scene lacks has no mean.
-    means = groups[names].agg(lambda values: values.mean(skipna=False)).where(complete, axis=0)
+    has_all = groups[names].count().eq(groups.size(), axis=0)
+    means = groups[names].mean().where(has_all).where(complete, axis=0)
     methods = groups[["control", "mixed"]].first().reset_index()
     return _table(
         {
             "Method": _methods(methods),
-            "Preset": methods["preset"],
+            "Preset": methods["preset"].map(escaped),
             "Scenes": [f"{count} of {n_scenes}" for count in scored],
         },
         {
@@ -157,8 +200,8 @@ def _mean_table(rows: pd.DataFrame, n_scenes: int, letters: dict[str, str]) -> s
 
 def _failures(table: pd.DataFrame) -> list[str]:
     failed = table[table["failed"]]
-    lines = [f"{_run_name(row)}: {row.status}: {one_line(row.reason)}" for row in failed.itertuples()]
-    return ["## Failed runs", bullets(lines)] if lines else []
+    lines = [f"{_run_name(row)}: {escaped(row.status)}: {escaped(row.reason)}" for row in failed.itertuples()]
+    return ["## Failed runs", bullets(_bounded(lines))] if lines else []
 
 
 def _claims(table: pd.DataFrame) -> list[str]:
@@ -166,13 +209,17 @@ def _claims(table: pd.DataFrame) -> list[str]:
     lines = []
     for row in table.itertuples():
         for result in row.results:
-            for name, claimed in sorted(result.claimed.items()):
+            # Those of the protocol's metrics first: they can be compared.
+            claims = sorted(result.claimed.items(), key=lambda claim: (claim[0] not in METRICS, claim[0]))
+            for name, claimed in claims[:_MAX_CLAIMS]:
                 verified = "no metric of ours"
                 if name in METRICS:
                     value = result.value(name)
                     verified = stored(name, value, "not verified") + filter_mark(METRICS[name], result.mixed, value)
-                lines.append(f"{_run_name(row)}, {one_line(name)}: claimed {claimed:g}, verified {verified}")
-    return ["## Claimed by the submitters", bullets(lines)] if lines else []
+                lines.append(f"{_run_name(row, result)}, {escaped(name)}: claimed {claimed:g}, verified {verified}")
+            if len(claims) > _MAX_CLAIMS:
+                lines.append(f"{_run_name(row, result)}: and {len(claims) - _MAX_CLAIMS} more claims")
+    return ["## Claimed by the submitters", bullets(_bounded(lines))] if lines else []
 
 
 def _missing(table: pd.DataFrame) -> list[str]:
@@ -186,21 +233,36 @@ def _missing(table: pd.DataFrame) -> list[str]:
         for name in expected:
             metric = first.metrics.get(name)
             if metric is not None and metric.value is None:
-                methods[name, one_line(metric.reason or "")].add(row.method)
-    lines = sorted(f"{name}: {reason} ({', '.join(sorted(by))})" for (name, reason), by in methods.items())
-    return ["## Why a figure is missing", bullets(lines)] if lines else []
+                methods[name, escaped(metric.reason or "")].add(escaped(row.method))
+    lines = sorted(f"{name}: {reason} ({_few(sorted(by))})" for (name, reason), by in methods.items())
+    return ["## Why a figure is missing", bullets(_bounded(lines))] if lines else []
+
+
+def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
+    lines = [f"{escaped(each.path)}: {escaped(each.reason)}" for each in left_out]
+    return ["## Files that are in no table", bullets(_bounded(lines))] if lines else []
+
+
+def _bounded(lines: list[str]) -> list[str]:
+    more = len(lines) - _MAX_LINES
+    return lines if more <= 0 else [*lines[:_MAX_LINES], f"and {more} more"]
+
+
+def _few(names: list[str], most: int = 30) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _sources(sources: Sequence[ResultFile]) -> str:
     digests = [source.result.digests for source in sources]
     return markdown_table(
         {
-            "Result": [source.path for source in sources],
-            "Scene": [f"`{digest.scene[:12]}`" for digest in digests],
-            "Submission": [f"`{digest.submission[:12]}`" for digest in digests],
+            "Result": [escaped(source.path) for source in sources],
+            "Scene": [f"`{_digest(digest.scene, 12)}`" for digest in digests],
+            "Submission": [f"`{_digest(digest.submission, 12)}`" for digest in digests],
         }
     )
 
 
-def _run_name(row: pd.Series) -> str:
-    return f"{row.method} ({one_line(row.preset)}, seed {row.results[0].seed}) on {row.scene}"
+def _run_name(row: pd.Series, result: Result | None = None) -> str:
+    seed = (result or row.results[0]).seed
+    return f"{escaped(row.method)} ({escaped(row.preset)}, seed {seed}) on {escaped(row.scene)}"

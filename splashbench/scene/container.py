@@ -1,12 +1,11 @@
 """The container that the liquid is poured into, as a triangle mesh in scene units: reading and checking it.
 
-scene.json names the file (`container_mesh`: PLY, GLB or OBJ) and its place (`container_pose`). A mesh is read by
-trimesh, from memory and with limits: it may come from a stranger, and must not make it open other files.
+scene.json names the file (`container_mesh`: PLY, GLB or OBJ) and its place (`container_pose`). A mesh may come from a
+stranger: trimesh reads it in a process of its own (mesh_process.py), and opens no other file.
 """
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -15,11 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import require_plain_file
 
 #: endings of mesh files that are read
 FORMATS = (".ply", ".glb", ".obj")
-MAX_MESH_BYTES = 256 << 20
 MAX_FACES = 2_000_000
 # Scene units: nothing real comes near, and squares stay finite.
 _LARGEST = 1e9
@@ -117,34 +114,16 @@ def read_mesh(path: Path) -> ContainerMesh:
 
     Textures, materials and files that it refers to are not read. Raises SplashbenchError naming the file.
     """
-    import trimesh
+    from splashbench.scene import mesh_process
 
     path = Path(path)
     try:
-        require_plain_file(path)
-        if path.stat().st_size > MAX_MESH_BYTES:
-            raise SplashbenchError(f"{path} is larger than {MAX_MESH_BYTES >> 20} MiB; simplify the mesh")
-        content = io.BytesIO(path.read_bytes())
+        return ContainerMesh(*mesh_process.decode(path, MAX_FACES))
     except FileNotFoundError:
         raise SplashbenchError(
             f"{path} does not exist; restore the container's mesh, or take container_mesh out of scene.json"
         ) from None
     except OSError as error:
         raise SplashbenchError(f"{path} cannot be read ({error}); restore it") from None
-    try:
-        # process=False: as the file has it; the checks are ContainerMesh's. No resolver: no file beside it is opened.
-        loaded = trimesh.load_scene(
-            content, file_type=path.suffix.lower()[1:], process=False, skip_materials=True, allow_remote=False
-        )
-        # A scene graph may show one part many times: counted before it is written out.
-        parts = (loaded.geometry[loaded.graph[node][1]] for node in loaded.graph.nodes_geometry)
-        count = sum(len(getattr(part, "faces", ())) for part in parts)
-        if count > MAX_FACES:
-            raise SplashbenchError(f"{path} has {count} faces, more than {MAX_FACES}; simplify the mesh")
-        mesh = loaded.to_mesh()
-        return ContainerMesh(mesh.vertices, mesh.faces)
-    except SplashbenchError:
-        raise
-    # A damaged file makes the readers of trimesh fail in any way that Python knows.
-    except Exception as error:
+    except ValueError as error:
         raise SplashbenchError(f"{path} is not a readable mesh ({error}); export it again") from None

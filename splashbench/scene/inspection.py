@@ -8,6 +8,7 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.progress import track
+from splashbench.scene.plausibility import calibration_faults
 from splashbench.scene.scene import Scene
 
 
@@ -17,7 +18,7 @@ def check_scene(directory: Path) -> list[str]:
         scene = Scene.open(directory)
     except SplashbenchError as error:
         return [str(error)]
-    faults: list[str] = []
+    faults = calibration_faults(scene)
     empty, full = dict.fromkeys(scene.cameras, 0), dict.fromkeys(scene.cameras, 0)
     pairs = [(camera, t) for camera in scene.cameras for t in range(scene.n_frames)]
     for camera, t in track(pairs, "checking the scene"):

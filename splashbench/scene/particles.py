@@ -11,6 +11,11 @@ from numpy.typing import NDArray
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_path, read_npz
 
+#: Of the arrays of a file, unpacked: 800 000 particles in single precision over 100 timesteps.
+MAX_BYTES = 1 << 30
+#: Rows of a file: each is sorted and looked at once per timestep.
+MAX_PARTICLES = 2_000_000
+
 
 @dataclass
 class Particles:
@@ -57,7 +62,9 @@ class Particles:
     @classmethod
     def load(cls, path: Path) -> Particles:
         """Read what `save` wrote, or a stranger's file of that layout; one-line errors name the file."""
-        arrays = read_npz(path, {"positions": 3, "active": 2}, optional={"velocities": 3})
+        arrays = read_npz(path, {"positions": 3, "active": 2}, optional={"velocities": 3}, max_bytes=MAX_BYTES)
+        if arrays["positions"].shape[1] > MAX_PARTICLES:
+            raise SplashbenchError(f"{path} has more than {MAX_PARTICLES} particles; write fewer")
         try:
             with np.errstate(over="ignore"):
                 particles = cls(arrays["positions"], arrays["active"], arrays.get("velocities"))

@@ -27,6 +27,8 @@ Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.bool_])
 
 # Without timestamps a scene still has an order; metrics that need seconds look at `times_source`.
 NOMINAL_STEP_SECONDS = 1 / 30
+# Of the static points, unpacked: 19 million in double precision.
+_MAX_POINTS_BYTES = 1 << 30
 
 
 class Scene:
@@ -170,7 +172,7 @@ class Scene:
         path = self.directory / "init_pt_cld.npz"
         if not path.exists():
             return None
-        data = read_npz(path, {"data": 2})["data"]
+        data = read_npz(path, {"data": 2}, max_bytes=_MAX_POINTS_BYTES)["data"]
         if data.shape[1] < 6:
             raise SplashbenchError(f"{path}: data has {data.shape[1]} columns, not x y z r g b seg; write it again")
         segment = data[:, 6:7] if data.shape[1] > 6 else np.zeros((len(data), 1))

@@ -25,6 +25,7 @@ from splashbench.score.particles.uniformity import DistanceFields
 from splashbench.score.result import CheckpointScore, Digests, MetricValue, Result, metric_value
 from splashbench.score.settings import PROTOCOL_V1, Protocol
 from splashbench.score.truth.comparison import score_ground_truth
+from splashbench.submission.scene_files import mismatch
 from splashbench.version import __version__
 
 REFERENCE_METHOD = "nothing"
@@ -163,10 +164,7 @@ def _text(status: Any) -> str:
 def require_same_scene(scene: Scene, submission: Any, what: str = "submission") -> None:
     """Raise SplashbenchError unless `submission` was made for these very bytes of `scene`."""
     if submission.identity.scene_digest != scene.digest:
-        raise SplashbenchError(
-            f"the {what} of {submission.identity.method} was made for another version of scene "
-            f"{submission.identity.scene}, not for {scene.directory}; give the scene it was run on, or run it again"
-        )
+        raise SplashbenchError(mismatch(scene, submission, what))
 
 
 def require_reference(scene: Scene, reference: Any) -> None:

@@ -8,19 +8,31 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import read_model, write_model
 from splashbench.score.metrics import METRICS, Better
+from splashbench.score.ranges import MEANS_OF_FRAMES, MEANS_OF_VIEWS, MOST, range_fault
 from splashbench.score.settings import Protocol
-from splashbench.submission import Decision, with_current_names
+from splashbench.submission import Decision, Status, with_current_names
+from splashbench.submission.withheld import Withheld
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.+-]+")
+#: Of a result that is read: bytes of its file, figures that its submitter claims, and letters of a name.
+MAX_RESULT_BYTES, MAX_CLAIMS, MAX_NAME = 64 << 20, 1000, 200
+_MAX_HARDWARE = 80
+_STATUSES = frozenset(status.value for status in Status)
+_Figure = Annotated[float, Field(allow_inf_nan=False)]
+_Seconds = Annotated[float, Field(ge=0, le=MOST, allow_inf_nan=False)]
 
 
 class _Frozen(BaseModel):
@@ -31,7 +43,7 @@ class ViewValues(_Frozen):
     """A metric in one test view: its mean and the value of each frame, null for a skipped one."""
 
     value: float | None = Field(default=None, allow_inf_nan=False)
-    frames: tuple[float | None, ...] = ()
+    frames: tuple[_Figure | None, ...] = ()
 
 
 class MetricValue(_Frozen):
@@ -48,7 +60,7 @@ class MetricValue(_Frozen):
     version: int = 1
     skipped_frames: int = 0
     views: dict[str, ViewValues] = Field(default_factory=dict)
-    frames: tuple[float | None, ...] = ()
+    frames: tuple[_Figure | None, ...] = ()
 
 
 class CheckpointScore(_Frozen):
@@ -61,7 +73,7 @@ class CheckpointScore(_Frozen):
     status: str = "ok"
     reason: str = ""
     storage_bytes: int | None = Field(default=None, ge=0)
-    metrics: dict[str, Annotated[float, Field(allow_inf_nan=False)] | None] = Field(default_factory=dict)
+    metrics: dict[str, _Figure | None] = Field(default_factory=dict)
 
 
 class Digests(_Frozen):
@@ -97,17 +109,17 @@ class Result(_Frozen):
     told: tuple[str, ...] | None = None
     control: bool = False
     mixed: bool = False
-    withheld: str | None = None
+    withheld: Withheld | None = None
     status: str
     reason: str = ""
     protocol: Protocol
     digests: Digests
     metrics: dict[str, MetricValue]
     checkpoints: tuple[CheckpointScore, ...] = ()
-    stages: dict[str, float] = Field(default_factory=dict)
+    stages: dict[str, _Seconds] = Field(default_factory=dict)
     notes: dict[str, str] = Field(default_factory=dict)
     decisions: list[Decision] = Field(default_factory=list)
-    claimed: dict[str, float] = Field(default_factory=dict)
+    claimed: dict[str, _Figure] = Field(default_factory=dict)
     hardware: dict[str, Any] = Field(default_factory=dict)
     times_source: str = ""
     versions: dict[str, str] = Field(default_factory=dict)
@@ -136,10 +148,10 @@ class Result(_Frozen):
     @property
     def hardware_label(self) -> str:
         """One line for the machine a run was measured on; runs of different lines never share a speed chart."""
-        parts = [str(self.hardware[key]) for key in ("gpu", "device", "cpu") if self.hardware.get(key)]
+        parts = [_short(self.hardware[key]) for key in ("gpu", "device", "cpu") if self.hardware.get(key)]
         cores = self.hardware.get("cores")
         if cores:
-            parts.append(f"{cores} core{'' if cores == 1 else 's'}")
+            parts.append(f"{_short(cores)} core{'' if cores == 1 else 's'}")
         return ", ".join(parts) or "hardware not recorded"
 
     @property
@@ -157,8 +169,51 @@ class Result(_Frozen):
 
     @classmethod
     def load(cls, path: Path) -> Result:
-        """Read a result; one-line errors name the file and the entry."""
-        return read_model(path, cls)
+        """Read a result, which may be a stranger's; one-line errors name the file and the entry.
+
+        Raises SplashbenchError for what `splashbench score` never writes, see `faults`.
+        """
+        path = Path(path)
+        if path.is_file() and path.stat().st_size > MAX_RESULT_BYTES:
+            raise SplashbenchError(f"{path} is larger than {MAX_RESULT_BYTES >> 20} MiB; no result is")
+        result = read_model(path, cls)
+        fault = next(result.faults(), None)
+        if fault is not None:
+            raise SplashbenchError(f"{path}: {fault}; score the submission again")
+        return result
+
+    def faults(self) -> Iterator[str]:
+        """What scoring never writes, a line each: unknown statuses, figures out of range or apart from their frames."""
+        yield from self._name_faults()
+        if self.status not in _STATUSES:
+            yield f"status is {_short(self.status)!r}, which no run has ({', '.join(sorted(_STATUSES))})"
+        if len(self.claimed) > MAX_CLAIMS:
+            yield f"claimed has {len(self.claimed)} figures, more than {MAX_CLAIMS}"
+        for name, metric in self.metrics.items():
+            fault = self._range_fault(name, metric.value) or _mean_fault(name, metric)
+            if fault:
+                yield f"metrics.{_short(name)} {fault}"
+            if metric.value is not None and self.status != Status.OK.value and _is_score(name):
+                yield f"metrics.{name} has a value, yet the run ended with status {_short(self.status)}"
+        for number, checkpoint in enumerate(self.checkpoints):
+            for name, value in checkpoint.metrics.items():
+                fault = self._range_fault(name, value)
+                if fault:
+                    yield f"checkpoints.{number}.{_short(name)} {fault}"
+        seconds = [checkpoint.seconds for checkpoint in self.checkpoints]
+        if any(later < earlier for earlier, later in pairwise(seconds)) or max(seconds, default=0) > MOST:
+            yield "the seconds of its checkpoints do not rise"
+
+    def _name_faults(self) -> Iterator[str]:
+        names = {"method": self.method, "scene": self.scene, "preset": self.preset, "version": self.method_version}
+        for what, text in names.items():
+            if len(text) > MAX_NAME:
+                yield f"{what} has {len(text)} letters, more than {MAX_NAME}"
+            elif not text.isprintable():
+                yield f"{what} has control characters"
+
+    def _range_fault(self, name: str, value: float | None) -> str:
+        return range_fault(name, value, self.protocol.psnr_cap_db)
 
 
 def metric_value(
@@ -190,6 +245,35 @@ def frame_mean(name: str, frames: list[float | None], reason: str) -> MetricValu
     """Metric `name` as the mean over the frames that have a value; null for `reason` where none has."""
     skipped = sum(value is None for value in frames)
     return metric_value(name, mean(frames), reason, skipped_frames=skipped, frames=tuple(frames))
+
+
+def _short(value: Any) -> str:
+    """`value` on one bounded line: it may come from a stranger's file."""
+    text = one_line(str(value))
+    return text if len(text) <= _MAX_HARDWARE else text[: _MAX_HARDWARE - 1] + "…"
+
+
+def _is_score(name: str) -> bool:
+    return name in METRICS and METRICS[name].group != "cost"
+
+
+def _mean_fault(name: str, metric: MetricValue) -> str:
+    """Why the value of metric `name` is not that of its views or frames, in words; "" where it is, or has none."""
+    if name in MEANS_OF_VIEWS and metric.views:
+        for camera, view in metric.views.items():
+            if view.frames and not _same(view.value, mean(list(view.frames))):
+                return f"of view {_short(camera)} is not the mean of its frames"
+        if not _same(metric.value, mean([view.value for view in metric.views.values()])):
+            return "is not the mean of its views"
+    if name in MEANS_OF_FRAMES and metric.frames and not _same(metric.value, mean(list(metric.frames))):
+        return "is not the mean of its frames"
+    return ""
+
+
+def _same(stated: float | None, computed: float | None) -> bool:
+    if stated is None or computed is None:
+        return stated is computed
+    return math.isclose(stated, computed, rel_tol=1e-6, abs_tol=1e-6)
 
 
 def mean(values: list[float | None]) -> float | None:

@@ -1,30 +1,37 @@
 """The execution of a plan: runs that exist are reused, the others are made, one after another or several at once.
 
-A study that is killed loses only the runs in progress. A run that fails has an entry like any other.
+Several at once run here or on a Ray cluster, by the same code. A study that is killed loses only the runs in progress.
+A run that fails has an entry like any other. One whose machine is lost is made again.
 """
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from splashbench.child import child_command, raise_if_disk_was_full
+from splashbench.child import raise_if_disk_was_full
+from splashbench.cluster.place import workers_at
+from splashbench.cluster.work import Ended, Needs, Work, Workers
 from splashbench.errors import SplashbenchError
 from splashbench.files import require_folder_place, write_model, write_text
 from splashbench.score.image.lpips import load_lpips
-from splashbench.study.job import ERROR, Job, RunEntry, Store, carry_out, carry_out_file
+from splashbench.study.commit import commit, commit_failure, new_attempt, recover
+from splashbench.study.job import ERROR, Attempt, Job, RunEntry, Store, carry_out, carry_out_file
 from splashbench.study.plan import PlannedRun, StudyPlan
 
 _MARK = ".splashbench_study"
-_POLL_SECONDS = 0.1
+#: How often a run is started whose worker or machine is lost each time.
+_TRIES = 5
+#: For an entry that another machine has written to be seen here.
+_ARRIVAL_SECONDS = 5.0
+#: What the processes have imported that runs are forked off.
+_MODULES = ("splashbench.study.preload",)
 
 
 @dataclass
@@ -33,7 +40,10 @@ class ExecutionOptions:
 
     Attributes:
         only: names of variants; the others are left as they are. None for all.
-        jobs: runs at once.
+        jobs: runs at once; None for one here, and for as many as there is room for on Ray.
+        on: where they are made, see `cluster.place.workers_at`; None for this machine.
+        cores, memory_bytes: of a run, see `Needs`.
+        gpus: of a run that is no reference, on Ray; None for one where the study's device is cuda, else for none.
         keep: keep submissions, with renders and models.
         retry: run again what failed before.
         lpips_weights: see `splashbench.score.image.lpips.load_lpips`.
@@ -45,7 +55,11 @@ class ExecutionOptions:
     """
 
     only: tuple[str, ...] | None = None
-    jobs: int = 1
+    jobs: int | None = 1
+    on: str | None = None
+    cores: int | None = None
+    gpus: int | None = None
+    memory_bytes: int | None = None
     keep: bool = False
     retry: bool = False
     lpips_weights: Path | None = None
@@ -85,11 +99,49 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
         ]
         total = len(references) + len(missing)
         chosen = iter(missing.values()) if options.order is None else options.order(list(missing.values()))
-        progress = _Progress(total, options, _seconds_before(plan, store))
-        # First what others are measured against; it also fits the backgrounds that they share.
-        for runs, is_reference in ((references, True), (chosen, False)):
-            _run_all((_job(plan, run, out, options, is_reference) for run in runs), options.jobs, progress)
+        with _workers(plan, store, options, total) as workers:
+            needs = _needs(plan, options)
+            sharing = workers.sharing(needs) if workers else 1
+            at_once = max(1, workers.room(needs)) if workers else 1
+            progress = _Progress(total, options, _seconds_before(plan, store), at_once)
+            # First what others are measured against; it also fits the backgrounds that they share.
+            for runs, is_reference in ((references, True), (chosen, False)):
+                jobs = (_job(plan, run, store, options, is_reference, sharing) for run in runs)
+                if workers is None:
+                    _run_here(jobs, store, progress)
+                else:
+                    _run_all(jobs, replace(needs, gpus=0) if is_reference else needs, workers, store, progress)
         return Tally(progress.ended, len({run.digest for run in selected}) - len(missing))
+
+
+def _needs(plan: StudyPlan, options: ExecutionOptions) -> Needs:
+    """What a run that is no reference takes of a machine."""
+    gpus = options.gpus if options.gpus is not None else int(plan.spec.device.startswith("cuda"))
+    return Needs(options.cores, 0 if plan.spec.device == "cpu" else gpus, options.memory_bytes)
+
+
+@contextmanager
+def _workers(plan: StudyPlan, store: Store, options: ExecutionOptions, total: int) -> Iterator[Workers | None]:
+    """Where runs are made: None for this process itself, which shows how far each run is."""
+    needs = _needs(plan, options)
+    alone = options.on is None and (options.jobs or 1) == 1 and needs == replace(needs, cores=None, memory_bytes=None)
+    if alone or total == 0:
+        yield None
+        return
+    weights = [options.lpips_weights] if options.lpips_weights else []
+    files = [Path(_absolute(run.method).rpartition(":")[0]) for run in plan.runs if ":" in run.method]
+    scenes = [scene.scene.directory for scene in plan.scenes]
+    workers = workers_at(
+        options.on,
+        options.jobs,
+        _MODULES,
+        folder=store.cache.resolve(),
+        inputs=sorted({path.resolve() for path in (*scenes, *files, *weights)}),
+        needs=needs,
+        tell=options.tell,
+    )
+    with workers:
+        yield workers
 
 
 def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool, training: bool = False) -> bool:
@@ -110,14 +162,17 @@ def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool, tr
     )
 
 
-def _job(plan: StudyPlan, run: PlannedRun, out: Path, options: ExecutionOptions, is_reference: bool) -> Job:
+def _job(
+    plan: StudyPlan, run: PlannedRun, store: Store, options: ExecutionOptions, is_reference: bool, at_once: int
+) -> Job:
     return Job(
         digest=run.digest,
         title=f"{run.scene.name}__{run.variant.name}__seed{run.seed}__{run.digest[:8]}",
-        scene=str(run.scene.scene.directory),
+        scene=str(run.scene.scene.directory.resolve()),
+        scene_digest=run.scene.scene.digest,
         variant=run.variant,
         seed=run.seed,
-        method=run.method,
+        method=_absolute(run.method),
         preset=run.preset,
         overrides=dict(run.overrides),
         reference=run.reference,
@@ -125,13 +180,20 @@ def _job(plan: StudyPlan, run: PlannedRun, out: Path, options: ExecutionOptions,
         device="cpu" if is_reference else plan.spec.device,
         timeout_seconds=plan.spec.timeout_seconds,
         timing_frames=run.timing_frames,
-        lpips_weights=str(options.lpips_weights) if options.lpips_weights else None,
-        out=str(out),
+        lpips_weights=str(options.lpips_weights.resolve()) if options.lpips_weights else None,
+        out=str(store.out.resolve()),
+        attempt=str(new_attempt(store, run.digest).resolve()),
         keep=options.keep,
-        at_once=options.jobs,
+        at_once=at_once,
         picture=options.pictures,
         training=options.training and not is_reference,
     )
+
+
+def _absolute(method: str) -> str:
+    """`method`, of FILE.py:CLASS the file's absolute path: a child on another machine stands elsewhere."""
+    file, _, name = method.rpartition(":")
+    return f"{Path(file).resolve()}:{name}" if file else method
 
 
 def _seconds_before(plan: StudyPlan, store: Store) -> list[float]:
@@ -143,10 +205,10 @@ def _seconds_before(plan: StudyPlan, store: Store) -> list[float]:
 class _Progress:
     """Tells the user before each run which one it is and about how long the rest takes."""
 
-    def __init__(self, total: int, options: ExecutionOptions, seconds: list[float]) -> None:
+    def __init__(self, total: int, options: ExecutionOptions, seconds: list[float], at_once: int) -> None:
         # How many there will be is not known where the order may leave some out.
         self._total = total if options.order is None else None
-        self._jobs, self._tell = options.jobs, options.tell
+        self._at_once, self._tell = at_once, options.tell
         self._seconds, self._started, self.ended = seconds, 0, 0
 
     def starts(self, job: Job) -> None:
@@ -157,8 +219,12 @@ class _Progress:
         remaining = ""
         if self._seconds:
             mean = sum(self._seconds) / len(self._seconds)
-            remaining = f", about {duration(mean * (self._total - self.ended) / self._jobs)} left"
+            remaining = f", about {duration(mean * (self._total - self.ended) / self._at_once)} left"
         self._tell(f"run {self._started} of {self._total}{remaining}: {job.title}")
+
+    def is_lost(self, job: Job, reason: str) -> None:
+        """Tell of a run that starts once more."""
+        self._tell(f"lost: {job.title}: {reason}; it is made again")
 
     def ends(self, entry: RunEntry) -> None:
         self.ended += 1
@@ -174,73 +240,74 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _run_all(jobs: Iterable[Job], at_once: int, progress: _Progress) -> None:
+def _run_here(jobs: Iterable[Job], store: Store, progress: _Progress) -> None:
+    for job in jobs:
+        progress.starts(job)
+        attempt = Attempt(Path(job.attempt))
+        write_model(attempt.request, job)
+        try:
+            carry_out(job)
+        except BaseException:
+            shutil.rmtree(attempt.folder, ignore_errors=True)
+            raise
+        progress.ends(commit(store, attempt))
+
+
+def _run_all(jobs: Iterable[Job], needs: Needs, workers: Workers, store: Store, progress: _Progress) -> None:
     waiting = iter(jobs)
-    if at_once == 1:
-        for job in waiting:
-            progress.starts(job)
-            progress.ends(carry_out(job))
-        return
-    running: list[_Worker] = []
+    again: list[tuple[Job, int]] = []
+    running: dict[str, tuple[Job, int]] = {}
     more = True
-    try:
-        while more or running:
-            while more and len(running) < at_once:
-                job = next(waiting, None)  # type: ignore[assignment]
-                more = job is not None
-                if more:
-                    progress.starts(job)
-                    running.append(_Worker(job))
-            time.sleep(_POLL_SECONDS)
-            for worker in [worker for worker in running if worker.has_ended()]:
-                running.remove(worker)
-                progress.ends(worker.entry())
-    finally:
-        for worker in running:
-            worker.stop()
+    while more or again or running:
+        while (more or again) and workers.room(needs) > 0:
+            if again:
+                job, tries = again.pop()
+            else:
+                following = next(waiting, None)
+                if following is None:
+                    more = False
+                    continue
+                job, tries = following, 1
+                progress.starts(job)
+            attempt = Attempt(Path(job.attempt))
+            write_model(attempt.request, job)
+            task = f"{carry_out_file.__module__}:{carry_out_file.__qualname__}"
+            workers.start(Work(attempt.folder.name, task, attempt.request, attempt.log, needs))
+            running[attempt.folder.name] = job, tries
+        for ended in workers.wait():
+            job, tries = running.pop(ended.key)
+            if ended.lost and not Path(job.attempt, "entry.json").is_file() and tries < _TRIES:
+                progress.is_lost(job, ended.lost)
+                # In a folder of its own: nobody knows whether the lost one goes on.
+                job = job.model_copy(update={"attempt": str(new_attempt(store, job.digest).resolve())})
+                again.append((job, tries + 1))
+            else:
+                progress.ends(_entry(job, ended, store))
 
 
-class _Worker:
-    """A job in a process of its own."""
+def _is_there(path: Path, seconds: float) -> bool:
+    """Whether `path` is a file, or becomes one within `seconds`: other machines' files may arrive late."""
+    deadline = time.monotonic() + seconds
+    while not path.is_file():
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(0.1)
+        list(path.parent.iterdir())  # has a network file system look anew
+    return True
 
-    def __init__(self, job: Job) -> None:
-        self._job, self._store = job, Store(Path(job.out))
-        scratch = self._store.cache / "jobs"
-        request, self._log = scratch / f"{job.digest[:16]}.json", scratch / f"{job.digest[:16]}.log"
-        write_model(request, job)
-        with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                child_command(carry_out_file, request),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
 
-    def has_ended(self) -> bool:
-        return self._process.poll() is not None
-
-    def entry(self) -> RunEntry:
-        """The entry that the process wrote; an error entry where it ended without one."""
-        if self._process.returncode == 0:
-            entry = self._store.entry(self._job.digest)
-            if entry is not None:
-                return entry
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        raise_if_disk_was_full(self._process.returncode, lines)
+def _entry(job: Job, ended: Ended, store: Store) -> RunEntry:
+    """The entry that a run's process wrote, which counts now; an error entry where it ended without one."""
+    attempt = Attempt(Path(job.attempt))
+    if _is_there(attempt.entry, _ARRIVAL_SECONDS if ended.exit_code == 0 and not ended.lost else 0):
+        return commit(store, attempt)
+    reason = f"{ended.lost}, {_TRIES} times; give the same command again"
+    if not ended.lost:
+        lines = attempt.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        raise_if_disk_was_full(ended.exit_code, lines)
         last = lines[-1] if lines else "it said nothing"
-        reason = f"the run's process ended with exit code {self._process.returncode}: {last}"
-        entry = RunEntry(digest=self._job.digest, title=self._job.title, status=ERROR, reason=reason)
-        write_model(self._store.entry_path(self._job.digest), entry)
-        return entry
-
-    def stop(self) -> None:
-        """End the process, which ends what it started."""
-        self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=10)
-        self._process.kill()
-        self._process.wait()
+        reason = f"the run's process ended with exit code {ended.exit_code}: {last}"
+    return commit_failure(store, RunEntry(digest=job.digest, title=job.title, status=ERROR, reason=reason))
 
 
 @contextmanager
@@ -263,4 +330,5 @@ def claimed(store: Store) -> Iterator[None]:
         for folder in (store.submissions, *store.cache.glob("*"), *store.cache.glob("scenes/*")):
             for leftover in folder.glob(".tmp-*"):
                 shutil.rmtree(leftover, ignore_errors=True)
+        recover(store)
         yield

@@ -1,11 +1,14 @@
-"""One run of a study: fit, score, entry; in this process or a child.
+"""One run of a study: fit, score, entry; in this process, a child, or a child on another machine.
 
-It leaves a result in results/ and an entry in runs/. The entry is written last: a run with an entry is complete.
+It writes into the folder of its attempt alone, the entry last. The study's own process takes from there what counts
+(commit.py): of two attempts at one run, such as after a machine was taken for lost, only one does.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -24,17 +27,25 @@ from splashbench.study.training_views import TrainingScore, score_training_views
 from splashbench.submission import Record, Status, Submission
 from splashbench.submission.faded import FadedSubmission
 
+# A disk with less is full.
+_ROOM_BYTES = 16 << 20
 #: The status of a run that ended outside its method: in reading the scene, say, or in scoring.
 ERROR = "error"
 
 
 class Job(BaseModel):
-    """What the process of a run is given: the planned run with all its paths."""
+    """What the process of a run is given: the planned run with all its paths, absolute ones.
+
+    Attributes:
+        scene_digest: of the scene when the study was planned.
+        attempt: the folder that this attempt writes into; of no other attempt.
+    """
 
     model_config = ConfigDict(extra="forbid")
     digest: str
     title: str
     scene: str
+    scene_digest: str
     variant: StudyVariant
     seed: int
     method: str
@@ -47,6 +58,7 @@ class Job(BaseModel):
     timing_frames: int
     lpips_weights: str | None
     out: str
+    attempt: str
     keep: bool
     at_once: int
     picture: bool = False
@@ -62,6 +74,7 @@ class RunEntry(BaseModel):
         at_once: how many runs shared the machine.
         training: figures of training views, where they were asked for (training_views.py).
         seconds: duration of the run, scoring included.
+        attempt: name of the folder it was made in, which is gone.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -77,6 +90,7 @@ class RunEntry(BaseModel):
     training: TrainingScore | None = None
     at_once: int = 1
     seconds: float = 0.0
+    attempt: str = ""
 
 
 class Store:
@@ -86,6 +100,7 @@ class Store:
         self.out = Path(out)
         self.results, self.runs, self.submissions = self.out / "results", self.out / "runs", self.out / "submissions"
         self.cache = self.out / "cache"
+        self.pictures, self.attempts = self.out / "pictures", self.cache / "jobs"
 
     def entry(self, digest: str) -> RunEntry | None:
         """The entry of the run `digest`, None where there is none or its result is missing."""
@@ -109,7 +124,7 @@ class Store:
 
     def picture_path(self, digest: str, t: int) -> Path:
         """A render of the run: of the first test view at timestep `t`, see `pictured_timestep`."""
-        return self.out / "pictures" / f"{digest[:16]}_t{t}.png"
+        return self.pictures / f"{digest[:16]}_t{t}.png"
 
     def reference_path(self, digest: str) -> Path:
         """Folder of the submission of a reference run, which other runs are scored against."""
@@ -131,36 +146,65 @@ def pictured_timestep(n_frames: int) -> int:
 
 
 def carry_out(job: Job) -> RunEntry:
-    """Make the run, score it, and write its entry. A run that fails has an entry with a status and a reason.
+    """Make the run and score it, in the folder of its attempt. A run that fails has an entry with status and reason.
 
-    Raises DiskFullError only, since no other run would succeed either.
+    Raises DiskFullError where the disk stays full, since no other run would succeed either.
     """
-    store, start = Store(Path(job.out)), time.monotonic()
-    entry = RunEntry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once)
+    attempt, start = Attempt(Path(job.attempt)), time.monotonic()
+    entry = RunEntry(digest=job.digest, title=job.title, status=ERROR, at_once=job.at_once, attempt=attempt.folder.name)
+    attempt.folder.mkdir(parents=True, exist_ok=True)
     try:
-        entry = _scored(job, store, entry)
-    except DiskFullError:
-        raise
+        entry = _scored(job, attempt, entry)
+    except DiskFullError as error:
+        attempt.clear()
+        if not _there_is_room(attempt.folder):
+            raise
+        entry = entry.model_copy(update={"reason": f"the run filled the disk, and its files are removed: {error}"})
     except SplashbenchError as error:
         entry = entry.model_copy(update={"reason": str(error)})
     except Exception as error:  # a run of many: the others go on
         entry = entry.model_copy(update={"reason": one_line(f"{type(error).__name__}: {error}")})
-    earlier = store.entry(job.digest)
     entry = entry.model_copy(update={"seconds": time.monotonic() - start})
-    write_model(store.entry_path(job.digest), entry)
-    for stale in {earlier.result, earlier.faded} - {entry.result, entry.faded, None} if earlier else ():
-        (store.results / str(stale)).unlink(missing_ok=True)
+    write_model(attempt.entry, entry)
     return entry
 
 
-def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
-    original = Scene.open(Path(job.scene))
+class Attempt:
+    """The folder of one attempt at a run; `entry` is written last."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+        self.request, self.log, self.entry = folder / "request.json", folder / "log", folder / "entry.json"
+        self.results, self.pictures, self.submission = folder / "results", folder / "pictures", folder / "submission"
+
+    def clear(self) -> None:
+        """Remove what it has made so far, but for its log."""
+        for path in (self.results, self.pictures, self.submission):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _there_is_room(folder: Path) -> bool:
+    """Whether files can be written again, into `folder` and where runs have their scratch folders."""
+    for place in (folder, Path(tempfile.gettempdir())):
+        try:
+            with tempfile.TemporaryFile(dir=place) as stream:
+                os.posix_fallocate(stream.fileno(), 0, _ROOM_BYTES)
+        except OSError:
+            return False
+    return True
+
+
+def _scored(job: Job, attempt: Attempt, entry: RunEntry) -> RunEntry:
+    store, original = Store(Path(job.out)), Scene.open(Path(job.scene))
+    if original.digest != job.scene_digest:
+        raise SplashbenchError(
+            f"{job.scene} was changed while the study ran, maybe by a method; restore it and run the study again"
+        )
     scene = changed_scene(original, job.variant, job.seed, store.cache / "scenes")
-    place = store.reference_path(job.digest) if job.is_reference else store.submissions / job.title
     submission = run_method(
         job.method,
         scene.directory,
-        place,
+        attempt.submission,
         preset=job.preset,
         overrides=job.overrides,
         seed=job.seed,
@@ -179,20 +223,21 @@ def _scored(job: Job, store: Store, entry: RunEntry) -> RunEntry:
     weights = Path(job.lpips_weights) if job.lpips_weights else None
     # Evaluation data never change: the fields come from the scene itself, not from worse masks or fewer views.
     result = score_submission(scene, submission, reference, weights, fields=shared_fields(original))
-    saved, faded = result.save(store.results), None
+    saved, faded = result.save(attempt.results), None
     if job.picture and submission.status == Status.OK:
         t = pictured_timestep(scene.n_frames)
-        path = store.picture_path(job.digest, t)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        attempt.pictures.mkdir(exist_ok=True)
+        path = attempt.pictures / store.picture_path(job.digest, t).name
         write_png(path, submission.rendering(scene.test[0], t))
     if job.variant.unseen and submission.status == Status.OK:
         control = FadedSubmission(submission, scene)
-        faded = score_submission(scene, control, reference, weights, fields=shared_fields(original)).save(store.results)
+        scored = score_submission(scene, control, reference, weights, fields=shared_fields(original))
+        faded = scored.save(attempt.results)
     training = None
     if job.training and submission.status == Status.OK:
         training = score_training_views(job.method, scene, submission, weights, job.timeout_seconds)
     if not job.keep and not job.is_reference:
-        shutil.rmtree(place)
+        shutil.rmtree(attempt.submission)
     return entry.model_copy(
         update={
             "status": result.status,

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Method
+from splashbench.harness.devices import chosen_device
 from splashbench.harness.discovery import load_method
 from splashbench.harness.runner import TIMING_FRAMES, without_nulls
 from splashbench.scene import Scene
@@ -122,9 +123,7 @@ class _MethodChoice(NamedTuple):
 def _row(spec: StudySpec, variant: StudyVariant) -> _MethodChoice:
     name = variant.method or spec.method
     method = load_method(name)
-    if spec.device not in method.devices:
-        devices = ", ".join(method.devices)
-        raise SplashbenchError(f"study {spec.name}: method {method.id} runs on {devices}, not on {spec.device!r}")
+    chosen_device(method, spec.device)
     of_study_method = variant.method is None
     preset = variant.preset or (spec.preset if of_study_method else None) or next(iter(method.Config.presets))
     overrides, resolved = _checked(spec, method, variant.name, preset, variant.settings, with_base=of_study_method)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from splashbench.csv_cells import csv_text
 from splashbench.files import files_together, write_json, write_text
 from splashbench.study.chart import draw_chart
 from splashbench.study.spec import metric_of
@@ -46,7 +47,8 @@ def runs_csv(table: Table) -> str:
 
 
 def frame_csv(frame: pd.DataFrame) -> str:
-    """`frame` as CSV, nine digits of each number."""
+    """`frame` as CSV, nine digits of each number; no text in it is a formula."""
+    frame = frame.map(lambda cell: csv_text(cell) if isinstance(cell, str) else cell)
     return str(frame.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 

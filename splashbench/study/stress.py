@@ -88,8 +88,8 @@ def make_stress_plan(
     Raises SplashbenchError, one line, for a method, preset, scene or kind that does not exist, and where no harm is
     left.
     """
-    chosen = [_parsed(text) for text in methods]
-    labels = _labels(chosen)
+    chosen = [parse_method(text) for text in methods]
+    labels = method_labels(chosen)
     wanted = [Harm(kind, level) for kind in kinds_named(kinds) for level in sorted(set(levels))]
     opened = [thin(scene) for scene in [Scene.open(Path(entry)) for entry in scenes]]
     recordings = {scene.name: recording_of(scene) for scene in opened}
@@ -159,7 +159,7 @@ def higher_is_better(metric: str) -> bool:
     return metric_of(metric).better == "higher"
 
 
-def _parsed(text: str) -> tuple[str, str | None, dict[str, Any]]:
+def parse_method(text: str) -> tuple[str, str | None, dict[str, Any]]:
     """Method, preset and settings of METHOD or FILE.py:CLASS, with :PRESET, with :KEY=VALUE,KEY=VALUE, or with both."""
     parts = text.split(":")
     settings = parse_overrides(parts.pop().split(",")) if "=" in parts[-1] and len(parts) > 1 else {}
@@ -172,7 +172,7 @@ def _parsed(text: str) -> tuple[str, str | None, dict[str, Any]]:
     return method, rest[0] if rest else None, settings
 
 
-def _labels(chosen: Sequence[tuple[str, str | None, Mapping[str, Any]]]) -> list[str]:
+def method_labels(chosen: Sequence[tuple[str, str | None, Mapping[str, Any]]]) -> list[str]:
     """What each is called: the method's own name, with what tells it apart where a method comes twice."""
     names = [load_method(method).id for method, _, _ in chosen]
     if NOTHING in names:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from splashbench.files import files_together, write_text
-from splashbench.markdown import bullets, one_line
+from splashbench.markdown import bullets, escaped, one_line
 from splashbench.markdown import table as markdown_table
 from splashbench.score import Result
 from splashbench.score.notation import FILTER_MARK, FILTER_NOTE
@@ -196,7 +196,7 @@ def _markdown(
         parts += [f"## By {finding.metric}", _scores(finding), _points(stress, finding)]
         parts += [FILTER_NOTE] if finding.filtered else []
     failures = [
-        one_line(f"{run.scene.name}, {run.variant.name}, seed {run.seed}: {entry.status}: {entry.reason}")
+        escaped(f"{run.scene.name}, {run.variant.name}, seed {run.seed}: {entry.status}: {entry.reason}")
         for run in stress.plan.runs
         if (entry := store.entry(run.digest)) is not None and entry.status != "ok"
     ]
@@ -204,7 +204,7 @@ def _markdown(
     if failures:
         parts += ["## Failed runs", "Each keeps nothing.", bullets(failures)]
     if stress.left_out:
-        lines = [f"{h.kind.named()} {h.amount:g} {h.kind.unit}: {one_line(reason)}" for h, reason in stress.left_out]
+        lines = [f"{h.kind.named()} {h.amount:g} {h.kind.unit}: {escaped(reason)}" for h, reason in stress.left_out]
         parts += ["## Left out", bullets(lines)]
     if missing:
         parts.append(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from splashbench.submission.budget import Budget
 from splashbench.submission.decisions import MAX_DECISIONS, Decision
@@ -17,6 +18,8 @@ _NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+\[\]-]{0,99}$"
 
 #: No cost of a run comes near; anything beyond is no measurement (and infinity is none either).
 _MAX_COST = 10**15
+#: Of whole numbers and of lists and tables within each other, in what a submission says freely.
+_LARGEST_INTEGER, _MAX_NESTING = 2**63 - 1, 24
 #: Characters of a note in record.json, and notes, at most.
 MAX_NOTE, MAX_NOTES = 500, 50
 #: Figures by the names that records and results had before version 0.2 -> today's names.
@@ -28,6 +31,36 @@ def with_current_names(figures: Any) -> Any:
     if not isinstance(figures, dict):
         return figures
     return {RENAMED_FIGURES.get(name, name): value for name, value in figures.items()}
+
+
+def _plain_table(table: dict[str, Any]) -> dict[str, Any]:
+    """`table` where JSON can say it, hence a result. Raises ValueError naming the first entry that is none of text,
+    numbers, true, false, lists and tables: TOML has dates as well, and numbers without end."""
+    _require_plain("", table, 0)
+    return table
+
+
+def _require_plain(place: str, value: Any, depth: int) -> None:
+    if depth > _MAX_NESTING:
+        raise ValueError(f"more than {_MAX_NESTING} lists or tables within each other")
+    if isinstance(value, dict):
+        for key, part in value.items():
+            if not isinstance(key, str):
+                raise ValueError(f"{place}{key!r} is no text, which keys are")
+            _require_plain(f"{place}{key[:40]}.", part, depth + 1)
+    elif isinstance(value, (list, tuple)):
+        for part in value:
+            _require_plain(place, part, depth + 1)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{place.rstrip('.')} is {value}, which is no number")
+    elif isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+        raise ValueError(f"{place.rstrip('.')} is a whole number of more than 64 bits")
+    elif not (value is None or isinstance(value, (str, int, float))):
+        raise ValueError(f"{place.rstrip('.')} is a {type(value).__name__}, not text, a number, true or false")
+
+
+_Text = Annotated[str, Field(max_length=1000)]
+_Table = Annotated[dict[str, Any], AfterValidator(_plain_table)]
 
 
 class Status(str, Enum):
@@ -51,23 +84,23 @@ class Identity(BaseModel):
     schema_version: Literal[1] = 1
     protocol: Literal["v1"] = PROTOCOL
     method: str = Field(pattern=_NAME)
-    method_version: str = "1"
-    preset: str = "best"
-    settings: dict[str, Any] = Field(default_factory=dict)
+    method_version: _Text = "1"
+    preset: _Text = "best"
+    settings: _Table = Field(default_factory=dict)
     #: KEY=VALUE: settings that were given on top of the preset
     overrides: list[Annotated[str, Field(max_length=100_000)]] = Field(default_factory=list, max_length=1000)
     #: What the user said that the fit may cost, where anything was said.
     budget: Budget | None = None
-    seed: int = 0
-    device: str = "cpu"
-    scene: str
+    seed: int = Field(default=0, ge=-_LARGEST_INTEGER, le=_LARGEST_INTEGER)
+    device: _Text = "cpu"
+    scene: _Text
     scene_digest: str = Field(pattern=r"^[0-9a-f]{64}$")
     control: bool = False
     mixed: bool = False
     #: Timesteps that the method did not see; only they are scored (withheld.py).
     withheld: Withheld | None = None
-    splashbench_version: str = ""
-    hardware: dict[str, Any] = Field(default_factory=dict)
+    splashbench_version: _Text = ""
+    hardware: _Table = Field(default_factory=dict)
     #: What the submitter says the figures are; shown beside the verified ones, never instead of them.
     claimed: dict[str, float] = Field(default_factory=dict)
 
@@ -113,7 +146,7 @@ class Record(BaseModel):
     #: what the method decided by itself, in the order in which it did
     decisions: list[Decision] = Field(default_factory=list, max_length=MAX_DECISIONS)
     render_fps: float | None = Field(default=None, ge=0, le=_MAX_COST)
-    timed_frames: int | None = Field(default=None, ge=0)
+    timed_frames: int | None = Field(default=None, ge=0, le=_MAX_COST)
     peak_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
     peak_device_memory_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)
     storage_bytes: int | None = Field(default=None, ge=0, le=_MAX_COST)

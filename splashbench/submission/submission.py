@@ -12,7 +12,7 @@ SHA256SUMS                  of every other file
 
 from __future__ import annotations
 
-import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,22 +21,28 @@ from numpy.typing import NDArray
 from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import (
-    image_size,
-    read_gray,
-    read_image,
+    is_plain_file,
+    list_files,
     read_model,
+    read_plain,
+    read_png,
+    require_png,
     sha256_file,
     validate_model,
     write_model,
     write_png,
     write_text,
 )
-from splashbench.scene import Particles, Scene, SignedDistance
+from splashbench.scene import Camera, Particles, Scene, SignedDistance
 from splashbench.submission.identity import Checkpoint, Identity, Record, Status
 
 IDENTITY = "submission.toml"
 SUMS = "SHA256SUMS"
-_MAX_FILES = 200_000
+#: Of a submission's files together, and of their list of sums.
+MAX_BYTES, _MAX_SUMS_BYTES = 16 << 30, 64 << 20
+_SUM = re.compile(r"[0-9a-f]{64}")
+#: Folder of a test view's images -> their colour. Others would be scored as something that they do not show.
+_COLOURS = {"renders": "RGB", "alpha": "grey"}
 
 
 def render_path(directory: Path, kind: str, camera: str, t: int) -> Path:
@@ -56,28 +62,35 @@ def write_view(directory: Path, camera: str, t: int, rgb: NDArray[np.uint8], alp
 
 
 def seal(directory: Path, identity: Identity, record: Record) -> None:
-    """Write identity, record and, last, the digests of everything in `directory`."""
+    """Write identity, record and, last, the digests of everything in `directory`.
+
+    Raises SplashbenchError for a file in it that no submission may have, see `unusable_files`.
+    """
     directory = Path(directory)
+    faults = unusable_files(directory)
+    if faults:
+        raise SplashbenchError(f"{faults[0]}; a submission holds plain files alone")
     write_text(directory / IDENTITY, identity_text(identity))
     write_model(directory / "record.json", record)
-    lines = [f"{sha256_file(directory / name)}  {name}\n" for name in _files(directory)]
-    write_text(directory / SUMS, "".join(lines))
+    names = (name for name in list_files(directory).names if name != SUMS)
+    write_text(directory / SUMS, "".join(f"{sha256_file(directory / name)}  {name}\n" for name in names))
+
+
+def unusable_files(directory: Path) -> list[str]:
+    """A line for every link, pipe, device and unusable name below `directory`, and for more files or bytes than a
+    submission may have; nothing is opened."""
+    try:
+        listing = list_files(directory)
+    except SplashbenchError as error:
+        return [str(error)]
+    if listing.bytes > MAX_BYTES:
+        listing.faults.append(f"{directory} has more than {MAX_BYTES >> 30} GiB; this is no submission")
+    return listing.faults
 
 
 def identity_text(identity: Identity) -> str:
     """submission.toml of `identity`. Raises TypeError where its settings hold what TOML cannot say."""
     return toml.dumps(identity.model_dump(mode="json", exclude_none=True))
-
-
-def _files(directory: Path) -> list[str]:
-    """Paths of all files but SHA256SUMS, relative, in one order on every machine."""
-    names = []
-    for root, folders, files in os.walk(directory):
-        folders.sort()
-        names += [Path(root, name).relative_to(directory).as_posix() for name in files]
-        if len(names) > _MAX_FILES:
-            raise SplashbenchError(f"{directory} holds more than {_MAX_FILES} files; this is no submission")
-    return sorted(name for name in names if name != SUMS)
 
 
 class Views:
@@ -88,11 +101,12 @@ class Views:
 
     def rendering(self, camera: str, t: int) -> NDArray[np.uint8]:
         """Rendered sRGB uint8 [H, W, 3] of test view `camera` at timestep `t`."""
-        return read_image(render_path(self.directory, "renders", camera, t))
+        return read_png(render_path(self.directory, "renders", camera, t), _COLOURS["renders"])
 
     def alpha(self, camera: str, t: int) -> NDArray[np.float32]:
         """Rendered foreground opacity [H, W] in [0, 1] of test view `camera` at timestep `t`."""
-        return read_gray(render_path(self.directory, "alpha", camera, t)).astype(np.float32) / 255.0
+        path = render_path(self.directory, "alpha", camera, t)
+        return read_png(path, _COLOURS["alpha"]).astype(np.float32) / 255.0
 
 
 class Submission(Views):
@@ -117,7 +131,7 @@ class Submission(Views):
     def open(cls, directory: Path, verify: bool = True) -> Submission:
         """Read the submission in `directory`; with `verify`, refuse it when a file was changed, added or removed."""
         directory = Path(directory)
-        if not (directory / IDENTITY).is_file():
+        if not is_plain_file(directory / IDENTITY):
             raise SplashbenchError(f"{directory} is no submission (no {IDENTITY} in it); give a run's folder")
         if verify:
             faults = integrity_faults(directory)
@@ -165,34 +179,42 @@ def integrity_faults(directory: Path) -> list[str]:
     path = directory / SUMS
     if not path.is_file():
         return [f"{path} is missing"]
-    faults: list[str] = []
-    listed: dict[str, str] = {}
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        return [f"{path} cannot be read ({error})"]
-    for line in text.splitlines():
-        digest, separator, name = line.partition("  ")
-        if not separator or len(digest) != 64:
-            return [f"{path}: {line[:60]!r} is not a digest and a file name"]
-        listed[name] = digest
-    for root, folders, files in os.walk(directory):
-        faults += [f"{Path(root, name)} is a link" for name in [*folders, *files] if Path(root, name).is_symlink()]
+    faults = unusable_files(directory)
     if faults:
         return faults
-    present = set(_files(directory))
+    try:
+        text = read_plain(path, _MAX_SUMS_BYTES).decode("utf-8")
+    except SplashbenchError as error:
+        return [str(error)]
+    except (OSError, UnicodeDecodeError) as error:
+        return [f"{path} cannot be read ({error})"]
+    listed: dict[str, str] = {}
+    for line in text.removesuffix("\n").split("\n") if text else ():
+        digest, separator, name = line.removesuffix("\r").partition("  ")
+        if not separator or not _SUM.fullmatch(digest):
+            return [f"{path}: {line[:60]!r} is not a digest and a file name"]
+        if name in listed:
+            return [f"{path} lists {name[:200]!r} twice"]
+        listed[name] = digest
+    present = {name for name in list_files(directory).names if name != SUMS}
     faults += [f"{directory / name} is missing" for name in sorted(set(listed) - present)]
     faults += [f"{directory / name} is not listed in {SUMS}" for name in sorted(present - set(listed))]
-    faults += [
-        f"{directory / name} does not match its digest in {SUMS}"
-        for name in sorted(present & set(listed))
-        if sha256_file(directory / name) != listed[name]
-    ]
-    return faults
+    sums = (_sum_fault(directory / name, listed[name]) for name in sorted(present & set(listed)))
+    return faults + [fault for fault in sums if fault]
 
 
-def check_submission(directory: Path, scene: Scene | None = None) -> list[str]:
-    """Every fault of a submission at once, a line each: bytes, identity, and against `scene` sizes and frames."""
+def _sum_fault(path: Path, digest: str) -> str:
+    try:
+        return "" if sha256_file(path) == digest else f"{path} does not match its digest in {SUMS}"
+    except (SplashbenchError, OSError) as error:
+        return f"{path} cannot be read ({error})"
+
+
+def check_submission(directory: Path, scene: Scene | None = None, pixels: bool = False) -> list[str]:
+    """Every fault of a submission at once, a line each: bytes, identity, and against `scene` sizes and frames.
+
+    pixels: whether to unpack every view as well, see `require_png`.
+    """
     directory = Path(directory)
     try:
         submission = Submission.open(directory, verify=False)
@@ -215,25 +237,37 @@ def check_submission(directory: Path, scene: Scene | None = None) -> list[str]:
     for name, n_frames in instants.items():
         if n_frames != scene.n_frames:
             faults.append(f"{directory / name} has {n_frames} instants, the scene {scene.n_frames}")
-    faults += _view_faults(directory, scene)
+    faults += _view_faults(directory, scene, pixels)
     for _, views in submission.checkpoints():
-        faults += _view_faults(views.directory, scene)
+        faults += _view_faults(views.directory, scene, pixels)
     return faults
 
 
-def _view_faults(directory: Path, scene: Scene) -> list[str]:
-    """A line for every view below `directory` that is missing or has another size than the scene's."""
-    faults = []
-    for name in scene.test:
-        camera = scene.cameras[name]
-        for t in range(scene.n_frames):
-            for kind in ("renders", "alpha"):
-                path = render_path(directory, kind, name, t)
-                try:
-                    size = image_size(path)
-                except SplashbenchError as error:
-                    faults.append(str(error))
-                    continue
-                if size != (camera.width, camera.height):
-                    faults.append(f"{path} is {size[0]}x{size[1]}, not {camera.width}x{camera.height}")
-    return faults
+def _view_faults(directory: Path, scene: Scene, pixels: bool) -> list[str]:
+    """A line for every view below `directory` that scoring would refuse: see `require_png`, and of another size."""
+    views = [
+        (scene.cameras[name], kind, t)
+        for name in scene.test
+        for t in range(scene.n_frames)
+        for kind in ("renders", "alpha")
+    ]
+
+    def fault(view: tuple[Camera, str, int]) -> str:
+        return _view_fault(directory, *view, pixels)
+
+    if not pixels:
+        return [line for line in map(fault, views) if line]
+    from splashbench.parallel import each
+
+    return [line for line in each(fault, views) if line]  # unpacking releases the GIL
+
+
+def _view_fault(directory: Path, camera: Camera, kind: str, t: int, pixels: bool) -> str:
+    path = render_path(directory, kind, camera.name, t)
+    try:
+        header = require_png(path, _COLOURS[kind], pixels)
+    except SplashbenchError as error:
+        return str(error)
+    if (header.width, header.height) != (camera.width, camera.height):
+        return f"{path} is {header.width}x{header.height}, not {camera.width}x{camera.height}"
+    return ""

@@ -46,7 +46,7 @@ def write_balls_scene(
     """
     rng = np.random.default_rng(seed)
     times = np.linspace(0.0, 0.33, n_frames) + np.where(np.arange(n_frames) % 2, 0.25, 0.0) * 0.33 / n_frames
-    cameras = {str(i + 1): _camera(str(i + 1), place, size) for i, place in enumerate(_ARC_PLACES)}
+    cameras = ball_cameras(size)
     exposed = {name: times + (delays or {}).get(name, 0.0) for name in cameras}
     meta = SceneMeta(
         name="balls",
@@ -65,7 +65,7 @@ def write_balls_scene(
             n_frames=n_frames,
             frames=_frames(cameras, exposed),
             meta=meta,
-            initial_points=_floor_points(),
+            initial_points=floor_points(),
         )
         truth_particles(times, rng).save(staging / "truth" / "particles.npz")
     return Scene.open(directory)
@@ -87,6 +87,11 @@ def truth_particles(times: NDArray[np.float64], rng: np.random.Generator, per_ba
     velocities = np.stack([np.repeat(_VELOCITIES + falling * t, per_ball, axis=0) for t in times])
     active = np.ones(positions.shape[:2], dtype=bool)
     return Particles(positions.astype(np.float32), active, velocities.astype(np.float32))
+
+
+def ball_cameras(size: tuple[int, int]) -> dict[str, Camera]:
+    """The seven cameras by name, "1" to "7", of images of `size` (width, height) in pixels."""
+    return {str(i + 1): _camera(str(i + 1), place, size) for i, place in enumerate(_ARC_PLACES)}
 
 
 def _camera(name: str, place: int, size: tuple[int, int]) -> Camera:
@@ -112,11 +117,11 @@ def _frames(
 ) -> Iterator[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_]]]:
     for name, camera in cameras.items():
         for t, time in enumerate(times[name]):
-            yield name, t, *_render(camera, ball_centers(time))
+            yield name, t, *render_balls(camera, ball_centers(time))
 
 
-def _render(camera: Camera, centers: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Ray-cast image uint8 [H, W, 3] and mask [H, W]."""
+def render_balls(camera: Camera, centers: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Ray-cast image uint8 [H, W, 3] and mask [H, W] of balls around `centers` [3, 3]."""
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     local = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
     rays = local @ camera.w2c[:3, :3]
@@ -151,7 +156,7 @@ def _floor_and_sky(eye: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArr
     return np.where(floor[..., None], _pattern(np.clip(x, -3, 3), np.clip(z, -3, 3)), [0.75, 0.8, 0.85])
 
 
-def _floor_points(n: int = 24) -> NDArray[np.float32]:
+def floor_points(n: int = 24) -> NDArray[np.float32]:
     """Coloured points on the floor [n * n, 7], as a sparse reconstruction would give them."""
     x, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, n), np.linspace(-1.5, 1.5, n)))
     zero = np.zeros(n * n)

@@ -22,7 +22,7 @@ COMMON_KEYWORDS = {
     "keep_model": False,
     "replace": True,
 }
-DEFAULTS = {"seed": 0, "device": "cpu", "timeout_seconds": None, "exr": False, "keep_model": True, "replace": False}
+DEFAULTS = {"seed": 0, "timeout_seconds": None, "exr": False, "keep_model": True, "replace": False}
 
 
 def _handed_on(
@@ -46,13 +46,14 @@ def test_options_of_run(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments, keywords = _handed_on(monkeypatch, function, ["run", "nothing", "SCENE", "OUT"])
     assert arguments == ("nothing", Path("SCENE"), Path("OUT"))
     assert keywords.pop("oracle_geometry")
+    assert keywords.pop("tell")
     none = {"preset": None, "overrides": {}, "timing_frames": TIMING_FRAMES, "withheld": None}
     none["checkpoints"], none["budget"] = None, None
-    assert keywords == DEFAULTS | none
+    assert keywords == DEFAULTS | none | {"device": "auto"}
     words = ["--preset", "quick", "--set", "a.b=1", "--set", "c=x", "--withhold", "odd", "--timing-frames", 0]
     words += ["--checkpoints", "--budget-seconds", 60, "--budget-mb", 1.5]
     _, keywords = _handed_on(monkeypatch, function, ["run", "nothing", "SCENE", "OUT", *COMMON, *words])
-    del keywords["oracle_geometry"]
+    del keywords["oracle_geometry"], keywords["tell"]
     own = {"preset": "quick", "overrides": {"a": {"b": 1}, "c": "x"}, "timing_frames": 0, "withheld": "odd"}
     own["checkpoints"], own["budget"] = MARKS, Budget(seconds=60, storage_bytes=1_500_000)
     assert keywords == COMMON_KEYWORDS | own
@@ -73,7 +74,7 @@ def test_options_of_run_external(monkeypatch: pytest.MonkeyPatch, balls_director
     assert (code.mixed, code.shell, code.blank_test_images, code.masks) == (False, False, False, False)
     assert (code.render_command, code.importer, code.directory, code.points) == (None, None, Path(), 2000)
     assert callable(keywords.pop("initial_points"))
-    assert keywords == DEFAULTS | {"preset": None, "timing_frames": TIMING_FRAMES, "work": None}
+    assert keywords == DEFAULTS | {"device": "cpu", "preset": None, "timing_frames": TIMING_FRAMES, "work": None}
 
     words = ["--trained", "model", "--import", "a", "--method-version", "2b", "--mixed", "--shell", "--masks"]
     words += ["--blank-test-images", "--directory", "code", "--points", "0", "--preset", "long", "--work", "kept"]

@@ -23,6 +23,7 @@ class Served:
     Attributes:
         ranges: whether the server knows Range. length: whether it says how long the file is.
         cuts: bytes after which the connection breaks. statuses: answered instead of the file.
+        kind: Content-Type, where it is said. cookie: set by the answer.
         location: of a redirect. pause: seconds after each block of `block` bytes.
         asked: the Range header of each request, "" for none.
     """
@@ -36,6 +37,9 @@ class Served:
     pause: float = 0.0
     block: int = 1 << 14
     asked: list[str] = field(default_factory=list)
+    kind: str = ""
+    cookie: str = ""
+    cookies_asked: list[str] = field(default_factory=list)
 
 
 class FileServer:
@@ -70,6 +74,7 @@ class FileServer:
     def answer(self, request: BaseHTTPRequestHandler) -> None:
         file = self.files[request.path[1:]]
         file.asked.append(request.headers.get("Range", ""))
+        file.cookies_asked.append(request.headers.get("Cookie", ""))
         if file.statuses and (status := file.statuses.pop(0)) != 200:
             request.send_response(status)
             request.send_header("Retry-After", "0")
@@ -93,6 +98,10 @@ class FileServer:
             request.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
         if file.length:
             request.send_header("Content-Length", str(size - start))
+        if file.kind:
+            request.send_header("Content-Type", file.kind)
+        if file.cookie:
+            request.send_header("Set-Cookie", file.cookie)
         request.end_headers()
         end = min(size, start + file.cuts.pop(0)) if file.cuts else size
         for position in range(start, end, file.block):

@@ -28,6 +28,7 @@ from splashbench.prepare.gates import (
     sampling_gates,
     source_gate,
     sync_gates,
+    told_with,
 )
 from splashbench.prepare.masks.provider import mask_health
 from splashbench.prepare.poses.metric import MetricFrame
@@ -60,6 +61,59 @@ def test_only_essential_gates_stop() -> None:
     require([soft], "sessions/monday")
     with pytest.raises(SplashbenchError, match=r"sessions/monday: figure is 2, at most 1 is needed \(px, camera 4\)"):
         require([soft, hard], "sessions/monday")
+
+
+def test_whoever_films_again_is_told_of_everything_that_failed() -> None:
+    first, second = (Gate(f"figure_{k}", 2.0, 1.0, "at most", "px", True, f"film {k} again") for k in "ab")
+    warning = Gate("figure_c", None, 1.0, "at least", "px", False, "film c again")
+    good = Gate("figure_d", 1.0, 1.0, "at least", "px", True, "film d again")
+    with pytest.raises(SplashbenchError) as caught:
+        require([warning, first, good, second], "monday")
+    told = str(caught.value)
+    assert [told.count(f"film {k} again") for k in "abcd"] == [1, 1, 1, 0]
+    assert told.index("figure_a") < told.index("figure_b") < told.index("figure_c is unknown")  # what stops comes first
+    # A stage that fails for a reason that the gates before it know says so.
+    why = r"no pose for camera 4\. Besides: figure_a is 2, .*film a again"
+    with pytest.raises(SplashbenchError, match=why), told_with([first, good]):
+        raise SplashbenchError("no pose for camera 4")
+
+
+def test_a_lens_that_was_not_determined_stops() -> None:
+    """A board that was never tilted: the focal length's deviation was 125%."""
+    gates = intrinsics_gates({"1": calibration(), "2": calibration(focal_sigma=500.0), "3": calibration(21.0)})
+    with pytest.raises(SplashbenchError, match=r"lens_is_determined is 1\.25, .*film the board again .* 2, 3: tilt"):
+        require(gates, "monday")
+    with pytest.raises(SplashbenchError, match=r"lens_fits is 2\.1, .*film the board again with camera 2: flat"):
+        require(intrinsics_gates({"1": calibration(), "2": calibration(held_out=2.1)}), "monday")
+    require(intrinsics_gates({"1": calibration(focal_sigma=19.0, held_out=1.9)}), "monday")
+
+
+def test_every_gate_says_what_to_do() -> None:
+    frame = metric_frame(3e-2, {"board": 1.0, "distance": 0.8}, 2e-3)
+    poses = Poses(
+        {"1": np.eye(4)},
+        np.zeros((1, 4, 4)),
+        (0,),
+        calibration().lens,
+        9,
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        9.0,
+        9.0,
+        6,
+        {"1": 1.0},
+        {"1": 1.0},
+    )
+    gates = [
+        *intrinsics_gates({"1": calibration(50.0, 0.1, 9.0)}),
+        *pose_gates(poses, ["1", "2"], 480),
+        *metric_gates(frame),
+        *mask_gates({"1": mask_health([0, 0], 1000)}, 2),
+        *container_gates(placed(GOOD | {"1": 0.1, "2": 0.1}), ["1", "2", "3"], 1920),
+        source_gate({"1": 0.5}),
+    ]
+    assert len(gates) > 18
+    assert [gate.name for gate in gates if gate.remedy == "film it again"] == []
 
 
 def test_pixel_limit_scales_with_the_image() -> None:

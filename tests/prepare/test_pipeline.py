@@ -15,12 +15,16 @@ import av
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from splashbench import toml
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
 from splashbench.prepare.pipeline import PrepareOptions, prepare
+from splashbench.prepare.video.recording import Recording
+from splashbench.scene import look_at
+from splashbench.synth.recording.video import SensorNoise, write_recording
 
 WIDTH, HEIGHT, FPS, RATE = 128, 72, 30, 48000
 CAMERAS = ("1", "2", "3")
@@ -347,6 +351,76 @@ def test_a_camera_that_cannot_be_posed_is_named(synthetic: Path, tmp_path: Path)
     static = toml.load(session / "session.toml")["recordings"]["static"]["4"][0]
     write_clip(session / static, seconds=0.5, size=(480, 270))  # something else altogether
     fails(session, "no pose for camera 4;")
+
+
+@pytest.mark.slow
+def test_a_camera_that_was_bumped_after_its_static_clip_stops_it(synthetic: Path, tmp_path: Path) -> None:
+    """Two pixels of 480; the sound session's own shifts stand in its report."""
+    session = Path(shutil.copytree(synthetic, tmp_path / "session"))
+    static = session / toml.load(session / "session.toml")["recordings"]["static"]["4"][0]
+    frames = [np.roll(frame, (0, 2), (0, 1)) for _, frame in Recording([static]).frames(range(10))]
+    static.unlink()
+    write_recording(static, (frame for frame in frames), 30, np.zeros(16000, np.float32))
+    pattern = r"camera_shift is 2\.\d+, at most 0\.5 is needed \(.*camera 4: start .*camera 4 moved between its static"
+    fails(session, pattern, PrepareOptions(timesteps=5))
+    stillness = json.loads((session / "prepare/poses/stillness.json").read_text())["result"]
+    still = [s["px"] for camera, seen in stillness.items() if camera != "4" for s in seen.values()]
+    assert max(still) < 0.1
+
+
+def photograph_boards(session: Path, count: int) -> None:
+    """`count` photographs by every camera of the board held up before the rig, the n-th of all cameras together."""
+    from splashbench.synth.imaging.geometry import LOOK_AT
+    from splashbench.synth.recording.board_clip import board_images
+    from splashbench.synth.recording.plan import BOARD, RecordingOptions, make_plan
+
+    rng = np.random.default_rng(3)
+    recorders = make_plan(RecordingOptions(fps=30, particle_radius=0.004)).recorders
+    middle = np.mean([recorder.camera.center for recorder in recorders.values()], axis=0)
+    facing = look_at(middle, LOOK_AT)[:3, :3].T  # of a print held up to the middle of the rig: x right, y down
+    boards = []
+    for _ in range(count):
+        board = np.eye(4)
+        board[:3, :3] = facing @ Rotation.from_rotvec(rng.normal(0, 0.35, 3)).as_matrix()
+        centre = np.array(LOOK_AT) + rng.uniform(-0.12, 0.12, 3)
+        board[:3, 3] = centre - board[:3, :3] @ [4 * BOARD["square_metres"], 2.5 * BOARD["square_metres"], 0]
+        boards.append(board)
+    for name, recorder in recorders.items():
+        poses = [recorder.camera.w2c @ board for board in boards]
+        noise = SensorNoise(480, 270, (1, int(name)))
+        for k, image in enumerate(board_images(recorder.camera, BOARD, poses, rng)):
+            write_png(session / f"cameras/{name}/extrinsics/{k:02d}.png", noise.expose(image))
+
+
+@pytest.mark.slow
+def test_a_board_that_all_see_places_the_cameras_without_a_sweep(synthetic: Path, tmp_path: Path) -> None:
+    session = Path(shutil.copytree(synthetic, tmp_path / "session"))
+    photograph_boards(session, 25)
+    recordings = toml.load(session / "session.toml")["recordings"]
+    recordings["extrinsics"] = {camera: [f"cameras/{camera}/extrinsics"] for camera in recordings["pour"]}
+    edit(session, recordings=recordings)
+    with pytest.raises(SplashbenchError, match=r"places the cameras by the board; leave out that or \[sweep\]"):
+        prepare(session, tmp_path / "scene")
+    edit(session, sweep=None)
+    preparation = prepare(session, tmp_path / "scene", PrepareOptions(timesteps=5))
+    placed = {"camera_shift", "cameras_posed", "mean_reprojection", "centre_sigma", "board_residual", "scale_agreement"}
+    assert placed <= {gate.name for gate in preparation.gates if gate.passed}
+    assert preparation.metric.scale_source == "extrinsics"
+    assert set(preparation.metric.scales) == {"extrinsics", "board"}
+    truth = json.loads((synthetic / "truth/truth.json").read_text())["cameras"]
+    found, known = (
+        np.array([_centre(matrices[camera]) for camera in truth])
+        for matrices in (preparation.poses.w2c, {camera: value["w2c"] for camera, value in truth.items()})
+    )
+    # The scene's frame is the world's up to a rigid motion: its scale is the board's.
+    turn, _ = Rotation.align_vectors(known - known.mean(0), found - found.mean(0))
+    off = np.linalg.norm(turn.apply(found - found.mean(0)) + known.mean(0) - known, axis=1)
+    sigma = np.array([preparation.poses.centre_sigma[camera] for camera in truth])
+    print(f"centres off by {off * 1e3} mm, said {sigma * 1e3} mm")
+    assert off.max() < 5e-3
+    assert np.sqrt(np.mean((off / sigma) ** 2)) < 2
+    assert preparation.metric.scale_disagreement is not None
+    assert preparation.metric.scale_disagreement < 0.01
 
 
 def _centre(w2c: list[list[float]]) -> np.ndarray:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import resource
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -124,3 +127,53 @@ def test_a_mesh_outside_the_scene_or_of_another_kind_is_refused(balls_copy: Path
 def test_a_missing_mesh_is_named(balls_copy: Path) -> None:
     with pytest.raises(SplashbenchError, match=r"gone\.ply does not exist"):
         Scene.open(with_mesh(balls_copy, "gone.ply")).container_mesh()
+
+
+def _glb(path: Path, accessors: list[dict], nodes: int = 1, primitives: int = 1) -> Path:
+    """A glTF without any data that states `accessors`, and shows the mesh of the first one."""
+    header = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(nodes))}],
+        "nodes": [{"mesh": 0}] * nodes,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}] * primitives}],
+        "accessors": accessors,
+        "bufferViews": [],
+        "buffers": [],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(head + text)
+    return path
+
+
+def test_a_few_bytes_that_ask_for_gigabytes_are_held_to_the_limit(tmp_path: Path) -> None:
+    accessor = {"count": 400_000_000, "componentType": 5126, "type": "VEC3"}
+    path = _glb(tmp_path / "huge.glb", [accessor])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(
+        SplashbenchError, match=r"huge\.glb is not a readable mesh \(it needs more than 4 GiB or 60 s\)"
+    ):
+        read_mesh(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # KiB
+
+
+def test_a_mesh_that_takes_for_ever_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splashbench.scene.mesh_process._MAX_WAIT_SECONDS", 0.05)  # the child has not started by then
+    (path := tmp_path / "slow.ply").write_text(PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    with pytest.raises(SplashbenchError, match=r"slow\.ply is not a readable mesh \(it needs more than"):
+        read_mesh(path)
+
+
+def test_a_mesh_that_is_no_plain_file_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe.ply")
+    (tmp_path / "zero.glb").symlink_to("/dev/zero")
+    for name in ("pipe.ply", "zero.glb"):
+        with pytest.raises(SplashbenchError, match="is a device or pipe"):
+            read_mesh(tmp_path / name)
+    monkeypatch.setattr("splashbench.scene.mesh_process.MAX_FILE_BYTES", 1 << 20)
+    with (tmp_path / "large.obj").open("wb") as stream:
+        stream.truncate(2 << 20)
+    with pytest.raises(SplashbenchError, match=r"large\.obj is larger than 1 MiB"):
+        read_mesh(tmp_path / "large.obj")

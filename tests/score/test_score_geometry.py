@@ -1,5 +1,7 @@
 """Volume and surface against the truth, on balls whose overlap and distance are known in closed form."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -155,3 +157,14 @@ def test_stored_distances_keep_their_sign() -> None:
     assert geometry.phi.ravel().tolist() == [-127, -1, 0, 0, 8, 127, 16, 32]
     with pytest.raises(ValueError, match="NaN"):
         SignedDistance.of(values * np.nan, np.zeros(3), 1.0)
+
+
+def test_the_spacing_of_particles_that_lie_on_each_other_is_found_at_once() -> None:
+    points = lattice_ball(14.0, 1.5)
+    # Every second particle lies where the first does: their third neighbour is at no distance.
+    crowd = np.concatenate([points, np.tile(points[:1], (100_000, 1))])
+    began = time.process_time()
+    assert spacing(crowd) == 0.0
+    assert time.process_time() - began < 5
+    twice = np.concatenate([points, np.tile(points[:1], (len(points) // 3, 1))])
+    assert spacing(twice) == pytest.approx(1.5)

@@ -107,3 +107,44 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "made_up.npz", **made_up())  # type: ignore[arg-type]
     with pytest.raises(SplashbenchError, match="not those of AlexNet"):
         load_lpips(tmp_path / "made_up.npz")
+
+
+@pytest.fixture
+def unlike_real_ones(monkeypatch: pytest.MonkeyPatch) -> Lpips:
+    """The network with weights at random, biases among them: what it sees of black is not nothing."""
+    rng = np.random.default_rng(0)
+    arrays = {name: rng.normal(0, 0.05, array.shape).astype(np.float32) for name, array in made_up().items()}
+    arrays |= {f"lin{i}": np.abs(arrays[f"lin{i}"]) for i in range(5)}
+    monkeypatch.setattr(module, "WEIGHTS_SHA256", module.weights_digest(arrays))
+    return Lpips(arrays)
+
+
+def whole_images(metric: Lpips, first: np.ndarray, second: np.ndarray) -> float:
+    """The distance by the definition: features of the whole images, all of them."""
+    import torch
+
+    images = torch.from_numpy(np.stack([first, second]).astype(np.float32)).permute(0, 3, 1, 2)
+    total = 0.0
+    for features, head in zip(metric._features(2 * images - 1), metric._heads):
+        unit = features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
+        total += float(((unit[:1] - unit[1:]).square() * head).sum(1).double().mean())
+    return total
+
+
+@pytest.mark.parametrize("size", [(31, 31), (33, 470), (401, 212), (437, 523)])
+@pytest.mark.parametrize("place", ["corner", "middle", "end", "line", "everywhere"])
+def test_what_is_equal_is_not_looked_at_and_counts(unlike_real_ones: Lpips, size: tuple[int, int], place: str) -> None:
+    height, width = size
+    boxes = {
+        "corner": np.s_[:3, :5],
+        "middle": np.s_[height // 2 : height // 2 + 9, width // 3 : width // 3 + 1],
+        "end": np.s_[-1:, -2:],
+        "line": np.s_[height // 2, :],
+        "everywhere": np.s_[:, :],
+    }
+    rng = np.random.default_rng(1)
+    first = rng.random((height, width, 3))
+    second = first.copy()
+    second[boxes[place]] = rng.random(second[boxes[place]].shape)
+    expected = whole_images(unlike_real_ones, first, second)
+    assert unlike_real_ones(first, second) == pytest.approx(expected, rel=1e-4, abs=1e-12)

@@ -1,5 +1,7 @@
 """Velocities against the truth: endpoint errors of motions that are known exactly."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -85,3 +87,15 @@ def test_free_flight_is_told_from_rest_contact_and_the_last_step() -> None:
     assert falling is not None
     assert falling.tolist() == [True, False, True, False, False]
     assert free_flight(Particles(true.positions, active), 0, times, GRAVITY) is None
+
+
+def test_any_number_of_particles_at_one_place_is_compared_at_once() -> None:
+    """A leaf of the k-d tree would hold them all, and every true particle look at each."""
+    points, true = moving(2000)
+    others = np.concatenate([points, np.tile(points[:1], (200_000, 1))])
+    moved = np.concatenate([true, np.tile(true[:1], (200_000, 1))])
+    began = time.process_time()
+    found = compare(points, true, others, moved)
+    assert time.process_time() - began < 3
+    assert found.error == pytest.approx(0.0, abs=1e-12)
+    assert found.coverage == 1.0

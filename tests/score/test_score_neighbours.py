@@ -1,10 +1,13 @@
 """Sums over nearest neighbours against those of a k-d tree: points spread evenly, in clumps, afar and on one spot."""
 
+import time
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from splashbench.score.particles import neighbours
+from splashbench.score.particles.copies import limited_copies
 from splashbench.score.particles.neighbours import nearest_poly6_sums
 
 RADIUS = 0.3
@@ -79,3 +82,65 @@ def test_the_same_sums_in_any_order_and_on_any_number_of_threads(monkeypatch: py
     np.testing.assert_allclose(nearest_poly6_sums(points[order], 16, RADIUS), sums[order], rtol=1e-13)
     monkeypatch.setattr("splashbench.parallel.thread_count", lambda: 1)
     np.testing.assert_array_equal(nearest_poly6_sums(points, 16, RADIUS), sums)
+
+
+def _hostile(kind: str) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    half = 8000
+    if kind == "one point":
+        return np.full((20_000, 3), 0.7)
+    if kind == "nearly one point":
+        return 1e-300 * rng.random((2 * half, 3))
+    if kind == "half of them a clump":
+        return np.concatenate([1e-7 * rng.random((half, 3)), rng.random((half, 3)) * [3, 1, 3]])
+    if kind == "a clump amid strays":
+        return np.concatenate([1e-7 * rng.random((half, 3)), 0.3 * (rng.random((half, 3)) - 0.5)])
+    if kind == "two clumps, far apart":
+        return np.concatenate([1e-6 * rng.random((half, 3)), 1e-6 * rng.random((half, 3)) + 1e30])
+    raise AssertionError(kind)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["one point", "nearly one point", "half of them a clump", "a clump amid strays", "two clumps, far apart"],
+)
+def test_no_cloud_takes_the_square_of_its_number(kind: str) -> None:
+    points = _hostile(kind)
+    nearest_poly6_sums(points[:100], 64, RADIUS)  # compiled by now
+    began = time.process_time()
+    sums = nearest_poly6_sums(points, 64, RADIUS)
+    seconds = time.process_time() - began
+    assert seconds < 0.3  # points that are spread evenly: 0.05; every pair: 0.4 to 1.6
+    if "one point" in kind:
+        np.testing.assert_allclose(sums, 64 * RADIUS**6, rtol=1e-12)
+
+
+def test_a_clump_within_a_cloud_changes_no_sum() -> None:
+    points = _hostile("a clump amid strays")[6000:10_000]  # few enough for a tree
+    np.testing.assert_allclose(nearest_poly6_sums(points, 8, RADIUS), _by_tree(points, 8, RADIUS), rtol=1e-10)
+
+
+def test_points_that_lie_on_each_other_are_looked_at_as_often_as_it_takes() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.random((300, 3))[rng.integers(0, 300, 6000)]  # some twenty at each place
+    for count in (4, 64):
+        np.testing.assert_allclose(
+            nearest_poly6_sums(points, count, RADIUS), _by_tree(points, count, RADIUS), rtol=1e-9
+        )
+
+
+def test_copies_are_limited_and_each_point_knows_one_at_its_place() -> None:
+    rng = np.random.default_rng(6)
+    points = rng.random((50, 3))[rng.integers(0, 50, 3000)]
+    limited = limited_copies(points, 5)
+    assert limited is not None
+    kept, place = limited
+    assert len(kept) == 250
+    assert (np.diff(kept) > 0).all()
+    np.testing.assert_array_equal(points[kept][place], points)
+    np.testing.assert_array_equal(place[kept], np.arange(250))
+    for row in np.unique(points, axis=0):  # the first ones stay
+        rows = np.flatnonzero((points == row).all(axis=1))
+        np.testing.assert_array_equal(np.intersect1d(kept, rows), rows[:5])
+    assert limited_copies(rng.random((3000, 3)), 5) is None
+    assert limited_copies(points[:500], 5) is None

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from textwrap import shorten
 from typing import Any
 
 from splashbench.cli.arguments import add_method
 from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, table
 
+# Of the settings' column, and letters of a setting's help; --json has all of it.
+_MAX_WIDTH, _MAX_HELP = 44, 110
 _LIST_EPILOG = """\
 examples:
   splashbench methods list
@@ -77,14 +81,20 @@ def list_methods(arguments: argparse.Namespace) -> int:
     text = table(["id", "kind", "presets"], lines).splitlines()
     print(text[0] + "  title")
     for line, row in zip(text[1:], rows):
-        print(f"{line.ljust(len(text[0]))}  {row['title']}")
+        print(_printable(f"{line.ljust(len(text[0]))}  {row['title']}"))
     return 0
+
+
+def _printable(line: str) -> str:
+    """`line` without control characters: names and titles are those of installed packages."""
+    return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
 def show_method(arguments: argparse.Namespace) -> int:
     """Handle `splashbench methods show`."""
     from splashbench.errors import SplashbenchError
     from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
+    from splashbench.harness.settings_help import settings_help
 
     if arguments.method == ORACLE:
         raise SplashbenchError("the oracle is written by the harness and has no settings; just run it")
@@ -94,13 +104,33 @@ def show_method(arguments: argparse.Namespace) -> int:
     default = next(iter(method.Config.presets))
     facts = _facts(arguments.method)
     facts["settings"] = method.Config.preset(default).model_dump(mode="json")
+    facts["help"] = settings_help(method.Config)
+    facts["budgets"] = list(method.budgets)
+    facts["capacity"] = {name: list(values) for name, values in method.Config.capacity.items()}
     if arguments.json:
         emit(facts)
         return 0
-    print(f"{facts['id']}: {facts['title']}")
-    for preset, values in facts["presets"].items():
-        print(f"  preset {preset}: {values or 'as below'}")
-    print(f"  settings of preset {default} (change one with --set KEY=VALUE):")
-    for key, value in facts["settings"].items():
-        print(f"    {key} = {value}")
+    for line in _shown(facts, default):
+        print(_printable(line))
     return 0
+
+
+def _shown(facts: dict[str, Any], default: str) -> Iterator[str]:
+    """Presets, budgets and the ladder first, then every setting of the preset `default` with a line of help."""
+    yield f"{facts['id']}: {facts['title']}"
+    for preset, values in facts["presets"].items():
+        yield f"  preset {preset}: {values or 'as below'}"
+    options = {"seconds": "--budget-seconds", "storage_bytes": "--budget-mb", "memory_bytes": "--budget-memory"}
+    if facts["budgets"]:
+        kept = ", ".join(options.get(name, name) for name in facts["budgets"])
+        yield f"  keeps to budgets: {kept}"
+    if facts["capacity"]:
+        yield "  ladder of budgets, from the smallest model to the largest (splashbench study capacity):"
+        for name, values in facts["capacity"].items():
+            yield f"    {name}: {', '.join(map(str, values))}"
+    yield f"  settings of preset {default} (change one with --set KEY=VALUE):"
+    lines = {name: f"{name} = {value}" for name, value in facts["settings"].items()}
+    width = min(max(map(len, lines.values()), default=0), _MAX_WIDTH)
+    for name, line in lines.items():
+        said = shorten(facts["help"].get(name, ""), _MAX_HELP, placeholder=" ...")
+        yield f"    {line.ljust(width)}  {said}".rstrip()

@@ -15,6 +15,7 @@ from splashbench.harness.conformance.bench import Bench
 from splashbench.harness.conformance.report import NotTested
 from splashbench.harness.conformance.scene_copies import SceneCopy
 from splashbench.harness.conformance.subject import Answer, Subject
+from splashbench.harness.devices import chosen_device
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.runner import run_method
 from splashbench.scene import Scene
@@ -73,10 +74,7 @@ class Evidence:
         self.preset = preset or (_QUICK if _QUICK in presets else next(iter(presets)))
         self.overrides = dict(overrides)
         self.config = self.method.Config.preset(self.preset, self.overrides)
-        if device not in self.method.devices:
-            devices = ", ".join(self.method.devices)
-            raise SplashbenchError(f"method {self.method.id} runs on {devices}, not on {device!r}; leave --device out")
-        self.device, self.timeout_seconds = device, timeout_seconds
+        self.device, self.timeout_seconds = chosen_device(self.method, device), timeout_seconds
         self.bench, self._source = Bench(work), scene
         self._subject = Subject(
             id=self.method.id,

@@ -16,7 +16,7 @@ from splashbench.files import tree_bytes
 from splashbench.harness.external.collection import collect
 from splashbench.harness.external.commands import command_line
 from splashbench.harness.messages import Failure, Request
-from splashbench.harness.runner import particles_per_frame, run_phase
+from splashbench.harness.phases import particles_per_frame, run_phase
 from splashbench.harness.training_copy import make_training_copy
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Scene
@@ -158,7 +158,6 @@ class ExternalRun:
             scratch=str(self.scratch),
             model=str(model),
             output=str(self.staging),
-            result=str(self.scratch / "outcome.json"),
             progress=str(self.scratch / "progress"),
             timing_frames=timing_frames,
             exr=exr,
@@ -175,7 +174,7 @@ class ExternalRun:
                 raise Failure(outcome.status, outcome.reason)
         self._note(
             render_fps=outcome.render_fps,
-            timed_frames=outcome.timed_frames,
+            timed_frames=timing_frames,
             primitives_per_frame=outcome.primitives_per_frame,
             particles_per_frame=particles_per_frame(self.staging),
             renderer=outcome.renderer,

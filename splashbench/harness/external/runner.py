@@ -7,7 +7,6 @@ Then the test views come from a render command, from the fit command itself, or 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,12 +19,14 @@ from splashbench.harness import hardware
 from splashbench.harness.external.commands import require_command
 from splashbench.harness.external.importers import load_importer
 from splashbench.harness.external.phases import ExternalCode, ExternalRun
+from splashbench.harness.leftovers import clear_leftovers, held, scratch_folder
 from splashbench.harness.messages import Failure
 from splashbench.harness.runner import TIMING_FRAMES, drop_unwanted, require_unchanged, without_nulls
 from splashbench.scene import Scene
 from splashbench.scene.export import InitialPoints
-from splashbench.submission import IDENTITY, Identity, Submission, identity_text, seal
+from splashbench.submission import IDENTITY, Identity, Status, Submission, identity_text, seal
 from splashbench.submission.cameras import write_cameras
+from splashbench.submission.scene_files import write_scene_files
 from splashbench.version import __version__
 
 #: What a submission calls the settings that are in its commands.
@@ -68,26 +69,30 @@ def run_external(
         _require_apart(work, out, *inputs)
     scene = Scene.open(scene_directory)
     identity = _identity(code, scene, preset or PRESET, seed, device)
+    clear_leftovers(out)
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=inputs) as staging,
         _workplace(work) as scratch,
     ):
         run = ExternalRun(code, scene, scratch, staging, seed, device, timeout_seconds)
-        try:
-            run.export(initial_points)
-            run.fit()
-            if code.importer:
-                run.import_model(timing_frames, exr)
-            else:
-                run.render()
-                run.take_over(keep_model)
-            record = run.record
-        except Failure as failure:
-            fault = {"status": failure.status, "reason": failure.reason, "log_tail": run.log_tail}
-            record = run.record.model_copy(update=fault)
+        with held(staging):
+            try:
+                run.export(initial_points)
+                run.fit()
+                if code.importer:
+                    run.import_model(timing_frames, exr)
+                else:
+                    run.render()
+                    run.take_over(keep_model)
+                record = run.record
+            except Failure as failure:
+                fault = {"status": failure.status, "reason": failure.reason, "log_tail": run.log_tail}
+                record = run.record.model_copy(update=fault)
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, code.name)
         write_cameras(staging, scene)
+        if record.status == Status.OK:
+            write_scene_files(staging, scene)
         seal(staging, identity, record)
     return Submission.open(out)
 
@@ -139,7 +144,7 @@ def _identity(code: ExternalCode, scene: Scene, preset: str, seed: int, device: 
             scene=scene.name,
             scene_digest=scene.digest,
             splashbench_version=__version__,
-            hardware=hardware.describe(),
+            hardware=hardware.describe(device),
         )
     except ValidationError as error:
         first = error.errors()[0]
@@ -159,9 +164,8 @@ def _require_apart(work: Path, *others: Path) -> None:
 def _workplace(work: Path | None) -> Iterator[Path]:
     """A folder for everything on the way; `work` stays, a temporary one goes."""
     if work is None:
-        # What the code left in it may resist removal; that must not cost the run.
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-            yield Path(scratch).resolve()
+        with scratch_folder() as scratch:
+            yield scratch
         return
     require_folder_place(work)
     if work.exists() and any(work.iterdir()):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, signal
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 Samples = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -23,6 +24,13 @@ _LOWEST_HZ, _HIGHEST_HZ = 150.0, 16000.0  # below: handling noise, mains hum; ab
 _HOP_S = 0.002  # of the loudness envelope
 _UPSAMPLING = 4
 _NEIGHBOURHOOD_S = 1.5e-3  # peaks this near are the same one, with its first reflections
+NEAR_S = 0.04  # peaks this near are reflections; those further off are other moments of the sound
+_FRAME_S = 0.02  # over which the loudness is levelled, longer than a clap
+ECHO_REACH_S = 0.05  # how much later than the direct sound a reflection is looked for: 17 m of detour
+_SHORTEST_ECHO_S = 1.2e-3  # earlier ones shift the peak rather than make another
+_SAME_ECHO_S = 4e-4  # peaks this near are one echo's
+_LEAST_ECHO = 0.16  # of the chosen arrival's strength; twice what good recordings show
+_LEAST_OWN_ECHO = 0.07  # of the autocorrelation
 
 
 @dataclass(frozen=True)
@@ -115,16 +123,18 @@ def measure(
     seconds: float,
     block: int = 0,
     max_windows: int = 200,
+    spacing: float = 0.5,
 ) -> list[DelayWindow]:
     """Delays in windows of `seconds` over the overlap of x and y, each within `reach` seconds of the line's prediction.
 
-    `block`: samples per transform (a power of two); 0 chooses one that the reach fits into. Where windows
-    overlapping by half would be more than `max_windows`, the loudest of each stretch is taken.
+    `block`: samples per transform (a power of two); 0 chooses one that the reach fits into. `spacing`: from window to
+    window, in windows; from 1 on they do not overlap. Where they would be more than `max_windows`, the loudest of each
+    stretch is taken.
     """
     start, clock = line
     begin = max(0.0, -start / clock)
     end = min(len(y) / rate, (len(x) / rate - start) / clock)
-    count = max(1, int(2 * (end - begin) / seconds - 1))
+    count = max(1, int((end - begin - seconds) / (seconds * spacing) + 1))
     middles = np.linspace(begin + seconds / 2, end - seconds / 2, count) if count > 1 else np.array([(begin + end) / 2])
     if count > max_windows:
         tenth = rate // 10
@@ -161,18 +171,128 @@ def measure_span(
     return DelayWindow(float(middle), float(line[0] + (line[1] - 1) * middle + lag), _prominence(window, at, fine_rate))
 
 
-def peak_ratio(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> float:
-    """Height of the correlation peak on the clock line, over all sound in common, relative to the next within 40 ms."""
+def peak_ratios(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> tuple[float, float]:
+    """Height of the correlation peak on the clock line over the highest within `NEAR_S`, and over that at other lags.
+
+    Lags nearby are compared with GCC-PHAT over all sound in common, which tells reflections apart; all others by the
+    correlation of whole recordings.
+    """
     span = (max(0.0, -line[0]), min(len(y) / rate, len(x) / rate - line[0]))
     correlation = _correlate(x, y, rate, line, span, 8192)
     if correlation is None:
-        return 0.0
+        return 0.0, 0.0
     fine_rate = rate * _UPSAMPLING
-    half = round(0.04 * fine_rate)
+    half = round(NEAR_S * fine_rate)
     window = np.roll(correlation, half)[: 2 * half + 1]
     near = round(_NEIGHBOURHOOD_S * fine_rate)
     at = half - near + int(np.argmax(window[half - near : half + near + 1]))
-    return _prominence(window, at, fine_rate)
+    return _prominence(window, at, fine_rate), _far_ratio(x, y, rate, line)
+
+
+def _far_ratio(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> float:
+    """Height of the whole recordings' correlation on the line over the highest further than `NEAR_S` from it."""
+    start, clock = line
+    n = round(len(y) * clock)
+    # The nearest sample is at most 10 us off, which is nothing below 4 kHz.
+    slip = np.round(np.arange(n, dtype=np.float32) * np.float32(1 / clock - 1)).astype(np.int32)
+    same_clock = y[np.clip(np.arange(n, dtype=np.int32) + slip, 0, len(y) - 1)]
+    step = max(1, rate // 8000)
+    low = rate / step
+    flat = [_flattened(samples, step, low) for samples in (x, same_clock)]
+    best = 0.0
+    # As they are, loud short sounds count; levelled, long quiet ones. Either may tell the lags apart.
+    for share in (0.0, 0.5, 1.0):
+        xs, ys = (_levelled(samples, low, share) for samples in flat)
+        size = fft.next_fast_len(len(xs) + len(ys), real=True)
+        correlation = np.abs(fft.irfft(fft.rfft(xs, size) * np.conj(fft.rfft(ys, size)), size))
+        around = round(start * low) + np.arange(-round(NEAR_S * low), round(NEAR_S * low) + 1)
+        reach = round(_NEIGHBOURHOOD_S * low)
+        middle = len(around) // 2
+        height = float(correlation[around[middle - reach : middle + reach + 1] % size].max())
+        correlation[around % size] = 0.0
+        rival = float(correlation.max())
+        best = max(best, height / rival if rival > 0 else 0.0)
+    return best
+
+
+def _flattened(samples: Samples, step: int, low: float) -> Samples:
+    """`samples` at `low` Hz (every `step`-th), all frequencies alike."""
+    decimated = signal.resample_poly(samples, 1, step).astype(np.float32) if step > 1 else samples
+    block = 512
+    if len(decimated) < block:
+        return decimated
+    _, power = signal.welch(decimated, low, nperseg=block, average="median")
+    gain = 1 / np.sqrt(power + 1e-3 * power.mean() + 1e-20)
+    frequency = np.linspace(0, low / 2, len(gain))
+    gain[(frequency < _LOWEST_HZ) | (frequency > 0.45 * low)] = 0
+    kernel = np.fft.fftshift(np.fft.irfft(gain)) * np.hanning(block)
+    return np.asarray(signal.oaconvolve(decimated, kernel.astype(np.float32), "same"), np.float32)
+
+
+def _levelled(flat: Samples, low: float, share: float) -> Samples:
+    """`flat`, at `low` Hz, with differences of loudness (in dB) reduced by `share`."""
+    # Running sums may come out below 0 in silence after a loud sound.
+    power = np.maximum(uniform_filter1d(np.square(flat), round(_FRAME_S * low), mode="constant"), 0)
+    loudness = np.sqrt(power)
+    audible = loudness > 1e-3 * loudness.max(initial=0.0)
+    levelled = np.zeros_like(flat)
+    levelled[audible] = flat[audible] / loudness[audible] ** share
+    return levelled
+
+
+def earlier_arrival(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> float:
+    """How much earlier than the chosen one, in seconds, a weaker arrival of the same sound comes; 0 where none does.
+
+    Positive in y, negative in x. A reflection louder than the direct sound makes the line follow it. The correlation
+    then has a second peak at the direct sound's delay, but so has one with a weaker reflection in the other
+    recording. The two differ in whose own echo it is, which each recording's autocorrelation shows. A voice's pitch
+    is in both alike, and left to right, so differences leave it out.
+    """
+    lags, other_peak, echo_of_y = _echoes(x, y, rate, line)
+    if not len(lags):
+        return 0.0
+    peaks = np.abs(other_peak) >= maximum_filter1d(np.abs(other_peak), round(_SAME_ECHO_S * rate * _UPSAMPLING))
+    earlier = peaks & (other_peak * echo_of_y > 0) & (np.abs(echo_of_y) >= _LEAST_OWN_ECHO)
+    strength = np.where(earlier, np.abs(other_peak), 0.0)
+    at = int(np.argmax(strength))
+    return float(np.sign(echo_of_y[at]) * lags[at]) if strength[at] >= _LEAST_ECHO else 0.0
+
+
+def _echoes(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> tuple[Floats, Floats, Floats]:
+    """Lags up to `ECHO_REACH_S`; the correlation there less that at the negative lag, by the main peak; and what y's
+    autocorrelation has there or next to it beyond x's. Empty without sound in common."""
+    span = (max(0.0, -line[0]), min(len(y) / rate, len(x) / rate - line[0]))
+    spectra: list[Floats] = []
+    correlation = _correlate(x, y, rate, line, span, 8192, spectra)
+    if correlation is None:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    fine_rate = rate * _UPSAMPLING
+    near = round(_NEIGHBOURHOOD_S * fine_rate / 2)
+    centre = int(np.argmax(np.roll(correlation, near)[: 2 * near + 1])) - near
+    around = np.roll(correlation, -centre)
+    lags = np.arange(round(_SHORTEST_ECHO_S * fine_rate), round(ECHO_REACH_S * fine_rate))
+    power_x, power_y, weight = spectra
+    own = _autocorrelation(power_y, weight, rate)[lags] - _autocorrelation(power_x, weight, rate)[lags]
+    beside = round(_SAME_ECHO_S / 4 * fine_rate)
+    most, least = maximum_filter1d(own, beside), minimum_filter1d(own, beside)
+    other_peak = (around[lags] - around[-lags]) / max(around[0], 1e-20)
+    return lags / fine_rate, other_peak, np.where(most > -least, most, least)
+
+
+def _autocorrelation(power: Floats, weight: Floats, rate: int) -> Floats:
+    """Autocorrelation at `_UPSAMPLING` times the rate, 1 at lag 0, of a sound with this power spectrum, flattened.
+
+    `weight`: of each frequency. Both are smoothed over 1 kHz: ripples of echoes over 1 ms stay.
+    """
+    bins = round(1000 / (rate / 2) * (len(power) - 1)) | 1
+    taper = np.hanning(bins + 2)[1:-1]
+    smooth, share = (
+        np.convolve(np.pad(values, bins // 2, "reflect"), taper / taper.sum(), "valid") for values in (power, weight)
+    )
+    padded = np.zeros((len(power) - 1) * _UPSAMPLING + 1)
+    padded[: len(power)] = share * power / np.maximum(smooth, 1e-20)
+    correlation = fft.irfft(padded)
+    return np.asarray(correlation / max(correlation[0], 1e-20))
 
 
 def _prominence(window: Floats, at: int, fine_rate: float) -> float:
@@ -192,12 +312,19 @@ def _vertex(values: Floats, at: int) -> float:
 
 
 def _correlate(
-    x: Samples, y: Samples, rate: int, line: tuple[float, float], span: tuple[float, float], block: int
+    x: Samples,
+    y: Samples,
+    rate: int,
+    line: tuple[float, float],
+    span: tuple[float, float],
+    block: int,
+    spectra: list[Floats] | None = None,
 ) -> Floats | None:
     """Circular correlation (at `_UPSAMPLING` times the rate) of x against y along the clock line, over y's `span`.
 
     Cross spectra of short blocks are added up after each was aligned by its own predicted delay, whole
-    samples by choice of the block and the rest by phase, so that drift within the span smears nothing.
+    samples by choice of the block and the rest by phase, so that drift within the span smears nothing. `spectra`
+    receives the power spectra of x and y, and the weight of each frequency.
     """
     start, clock = line
     hop = block // 2
@@ -236,6 +363,8 @@ def _correlate(
     weight = np.clip(coherence - 1.0 / n_used, 0, 1) if n_used > 3 else np.ones_like(coherence)
     band = (frequencies * rate >= _LOWEST_HZ) & (frequencies * rate <= min(_HIGHEST_HZ, 0.45 * rate))
     weighted = np.where(band & (size > 0), weight * cross / np.maximum(size, 1e-20), 0)
+    if spectra is not None:
+        spectra += [power_x, power_y, np.where(band, weight, 0.0)]
     padded = np.zeros(block * _UPSAMPLING // 2 + 1, np.complex128)
     padded[: len(weighted)] = weighted
     return np.asarray(fft.irfft(padded, block * _UPSAMPLING))

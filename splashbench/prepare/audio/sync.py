@@ -10,7 +10,15 @@ How well a rate is known: a short recording cannot tell drift from a sound sourc
 microphones change by some centimetres when the loudest source changes: `PATH_SD_S` in seconds. Windows that spread over
 `spread` seconds therefore know the rate no better than PATH_SD_S / spread, however small their scatter. So the slope
 is shrunk towards zero drift by Bayes' rule for two Gaussians; the other is the prior of device clocks, `RATE_PRIOR_SD`.
-6 s of sound give a rate near 1, ten minutes give the measured rate unchanged.
+A slope that does not differ from zero by twice its error is no drift: the rate is 1. Either way the clock states how
+far off its rate may be. 6 s of sound give a rate of 1, ten minutes give the measured rate unchanged.
+
+How it is known that the clock is the right one, which no good fit shows by itself:
+
+- No other lag may match nearly as well. Claps at equal intervals match at every multiple of them.
+- Enough windows that do not overlap must agree, over enough time. Each may lie anywhere within 20 ms, so that chance
+  agrees in one of fifty. One clap makes one window agree, in recordings of other takes as well.
+- No weaker copy of the sound may arrive before the one that the clock follows: that would be the direct sound.
 
 Arrival time is what is measured. Sound takes 2.9 ms per metre: cameras at unequal distances from the source are off by
 that much until they are `shifted` by their `sound_paths`.
@@ -30,7 +38,7 @@ from splashbench.prepare.audio import delay
 from splashbench.prepare.audio.delay import DelayWindow, Samples
 
 Floats = NDArray[np.float64]
-Status = Literal["ok", "silent", "clipped", "unrelated"]
+Status = Literal["ok", "silent", "clipped", "unrelated", "ambiguous", "unconfirmed"]
 
 RATE_PRIOR_SD = 50e-6  # the paper's cameras: -49 and -81 us/s for the worst two of seven
 PATH_SD_S = 1e-4  # 3.4 cm of change in path difference
@@ -41,6 +49,12 @@ SILENT_PEAK = 1e-3  # -60 dB of full scale: below, a track holds nothing but its
 CLIPPED_LEVEL, CLIPPED_FRACTION = 0.98, 0.02  # more than a clap close to the microphone
 MIN_CONFIDENCE = 2.0  # correlation peak over the next one; unrelated tracks stay below 1.5
 _TOLERANCE_S = 4e-4  # windows this close to the common line support it
+# What must agree with a clock: windows (of neighbours, every second one), a share of all, from first to last.
+MIN_AGREEING, MIN_AGREEMENT, MIN_SPREAD_S = 3, 0.1, 1.0
+_AUDIBLE, _CLEAR = 1.2, 2.0  # a window's peak over the next one: hardly chance, and no chance
+_BLOCK = 4096  # samples per transform
+_REACH_S = 0.02  # windows may lie this far from the line
+_SIGMAS = 2.0  # of a stated interval, 95 %
 
 
 @dataclass(frozen=True)
@@ -48,10 +62,18 @@ class ClockFit:
     """A camera's clock against the reference's: t_reference = start_s + clock_rate * t_local (seconds).
 
     Attributes:
-        start_s, clock_rate: NaN where `status` is not "ok": a doubtful track is never given an offset.
-        confidence: correlation peak over the highest other peak.
-        residual_rms_s: scatter of the windows about the line.
-        windows: (local time, delay from the line) of each of the `n_windows`, seconds.
+        start_s, clock_rate: NaN where `status` is not "ok": a doubtful track is never given an offset. The rate is
+            exactly 1 where the sound is too short to tell a drift from none.
+        confidence: correlation peak over the highest at any other lag.
+        residual_rms_s: RMS delay from the line of all windows with one clear peak, within 20 ms, whether they
+            support the line or not.
+        status: "ambiguous" where other lags match nearly as well, "unconfirmed" where too few windows agree.
+        windows: (local time, delay from the line) of each of the `n_windows` that the line was fitted to, seconds.
+        agreement: share of the windows, which do not overlap, that agree with the line.
+        drift_interval: the true rate lies within this of `clock_rate`, with 95 %.
+        interval_s: the true clock lies within this of the fitted one, with 95 %, while both cameras record.
+        echo_s: how much earlier than the chosen arrival a weaker one comes, which would be the direct sound; positive
+            in this camera, negative in the reference, 0 where there is none.
     """
 
     start_s: float
@@ -61,6 +83,10 @@ class ClockFit:
     n_windows: int
     status: Status
     windows: tuple[tuple[float, float], ...] = ()
+    agreement: float = 1.0
+    drift_interval: float = 0.0
+    interval_s: float = 0.0
+    echo_s: float = 0.0
 
     def to_reference(self, local_s: ArrayLike) -> Floats:
         """Local seconds to seconds on the reference camera's clock."""
@@ -133,6 +159,10 @@ def require_synced(fits: Mapping[str, ClockFit], files: Mapping[str, object]) ->
     remedies = {
         "silent": "its audio is silent; check the microphone, or leave the camera out",
         "clipped": "its audio is clipped; lower the recording level, or leave the camera out",
+        "ambiguous": "its audio matches the reference camera's at more than one offset; clap several times at"
+        " irregular intervals and record again, or leave the camera out",
+        "unconfirmed": "its audio agrees with the reference camera's for too short a time; make sounds that every"
+        " camera hears throughout the recording, such as irregular claps, or leave the camera out",
         "unrelated": "its audio does not match the reference camera's; check that both recorded the same sitting",
     }
     bad = [camera for camera, fit in fits.items() if fit.status != "ok"]
@@ -144,17 +174,65 @@ def require_synced(fits: Mapping[str, ClockFit], files: Mapping[str, object]) ->
         )
 
 
-def _flagged(status: Status, confidence: float = 0.0, n_windows: int = 0) -> ClockFit:
+def _flagged(status: Status, confidence: float = 0.0, n_windows: int = 0, agreement: float = 0.0) -> ClockFit:
     nan = float("nan")
-    return ClockFit(nan, nan, confidence, nan, n_windows, status)
+    return ClockFit(nan, nan, confidence, nan, n_windows, status, (), agreement, nan, nan, 0.0)
 
 
 def _fit_pair(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> ClockFit:
     """The clock of y against that of x, both counted from their first samples."""
-    line = None
-    best = 0.0
     if min(len(x), len(y)) < delay.MIN_OVERLAP_S * rate:
         return _flagged("unrelated")
+    line = _best_line(x, y, rate, rate_prior_sd)
+    if line is None:
+        return _flagged("unrelated")
+    begin, end = max(0.0, -line[0]), min(len(y) / rate, (len(x) / rate - line[0]) / line[1])
+    seconds = _window_seconds(end - begin)
+    for _ in range(2):
+        windows = delay.measure(x, y, rate, line, 2e-3, seconds, block=_BLOCK)
+        _, refined = _consensus(windows, line[0], rate_prior_sd, line[1])
+        if refined is None:
+            return _flagged("unrelated", 0.0, len(windows))
+        line = refined
+    width = _separate_seconds(end - begin)
+    separate = delay.measure(x, y, rate, line, _REACH_S, width, _BLOCK, spacing=1.0)
+    agreeing = [window for window in _inliers(separate, line)[0] if window.prominence >= _AUDIBLE]
+    # Noise agrees with a narrow window by chance in one case of five, so what the wide ones refuse has no say.
+    windows = [w for w in windows if any(abs(w.time_s - other.time_s) < seconds for other in agreeing)]
+    supporting, _ = _inliers(windows, line)
+    if len(supporting) < 2:
+        return _flagged("unrelated", 0.0, len(agreeing))
+    slope = _slope(*_arrays(supporting))
+    # The measured slope, not the one that is believed: sounds far apart must fall on one peak.
+    steepest = slope.delay - slope.drift * slope.time, 1 + slope.drift
+    near, far = delay.peak_ratios(x, y, rate, steepest)
+    confidence = min(near, far)
+    agreement = len(agreeing) / len(separate)
+    confirmed = _confirmed([window.time_s for window in agreeing], width) and agreement >= MIN_AGREEMENT
+    if not confirmed or confidence < MIN_CONFIDENCE:
+        stands_out = max(near, far) >= MIN_CONFIDENCE
+        status: Status = "ambiguous" if confirmed else "unconfirmed" if stands_out else "unrelated"
+        return _flagged(status, confidence, len(agreeing), agreement)
+    fit = _clock(slope, supporting, separate, (begin, end), rate_prior_sd)
+    return replace(fit, confidence=confidence, agreement=agreement, echo_s=delay.earlier_arrival(x, y, rate, steepest))
+
+
+def _confirmed(times: Sequence[float], width: float) -> bool:
+    """Whether windows that agree at these `times`, each `width` seconds long, are enough and span enough time."""
+    if not times or max(times) - min(times) < MIN_SPREAD_S:
+        return False
+    count, last = 0, -np.inf
+    for time in sorted(times):
+        # A sound on the edge of two windows makes both agree, and counts once.
+        if time - last > 1.5 * width:
+            count, last = count + 1, time
+    return count >= MIN_AGREEING
+
+
+def _best_line(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> tuple[float, float] | None:
+    """The line (start, rate) that has the most support among those through the candidate lags."""
+    line = None
+    best = 0.0
     for lag in delay.coarse_lags(x, y, rate):
         overlap = min(len(x) / rate - lag, len(y) / rate) - max(0.0, -lag)
         if overlap < delay.MIN_OVERLAP_S:
@@ -166,21 +244,45 @@ def _fit_pair(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> ClockF
         if candidate is not None and support > best:
             best, line = support, candidate
     if line is None:
-        return _flagged("unrelated")
-    overlap = len(y) / rate
-    for _ in range(2):
-        windows = delay.measure(x, y, rate, line, 2e-3, _window_seconds(overlap), block=4096)
-        _, refined = _consensus(windows, line[0], rate_prior_sd, line[1])
-        if refined is None:
-            return _flagged("unrelated", 0.0, len(windows))
-        line = refined
-    confidence = delay.peak_ratio(x, y, rate, line)
-    inliers, residuals = _inliers(windows, line)
-    if confidence < MIN_CONFIDENCE or len(inliers) < 2:
-        return _flagged("unrelated", confidence, len(inliers))
-    rms = float(np.sqrt(np.mean(residuals**2)))
-    scatter = tuple((window.time_s, float(residual)) for window, residual in zip(inliers, residuals))
-    return ClockFit(line[0], line[1], confidence, rms, len(inliers), "ok", scatter)
+        return None
+    # A window is clearer the less it reaches, so a weak reflection out of reach of the direct sound looks good.
+    seconds = _window_seconds(min(len(x) / rate - line[0], len(y) / rate) - max(0.0, -line[0]))
+    windows = delay.measure(x, y, rate, line, delay.ECHO_REACH_S, seconds, block=2 * _BLOCK, max_windows=60)
+    _, strongest = _consensus(windows, line[0], rate_prior_sd, line[1])
+    return strongest or line
+
+
+def _clock(
+    slope: _Slope,
+    supporting: Sequence[DelayWindow],
+    separate: Sequence[DelayWindow],
+    overlap: tuple[float, float],
+    rate_prior_sd: float,
+) -> ClockFit:
+    """The clock by the line through the `supporting` windows, with what is not known of it over `overlap`.
+
+    Both cameras record during `overlap`, seconds of y.
+    """
+    shrunk = slope.shrunk(rate_prior_sd)
+    earned = abs(slope.drift) > _SIGMAS * np.sqrt(slope.error_variance)
+    drift = shrunk if earned else 0.0
+    # The prior is of clocks in general and this one may be among the worst: what it took off is part of the interval.
+    left = 1 / np.sqrt(1 / rate_prior_sd**2 + 1 / slope.error_variance)
+    drift_interval = float(_SIGMAS * left + abs((slope.drift if earned else shrunk) - drift))
+    line = slope.delay - drift * slope.time, 1 + drift
+    _, residuals = _inliers(supporting, line, np.inf)
+    _, clear = _inliers([window for window in separate if window.prominence >= _CLEAR], line, np.inf)
+    return ClockFit(
+        line[0],
+        line[1],
+        float("nan"),
+        float(np.sqrt(np.mean(np.square(clear if len(clear) else residuals)))),
+        len(supporting),
+        "ok",
+        tuple((window.time_s, float(residual)) for window, residual in zip(supporting, residuals)),
+        drift_interval=drift_interval,
+        interval_s=_SIGMAS * slope.delay_sd + drift_interval * max(abs(end - slope.time) for end in overlap),
+    )
 
 
 def _window_seconds(overlap: float) -> float:
@@ -188,9 +290,17 @@ def _window_seconds(overlap: float) -> float:
     return float(np.clip(overlap / 8, 0.5, 4.0))
 
 
-def _inliers(windows: Sequence[DelayWindow], line: tuple[float, float]) -> tuple[list[DelayWindow], Floats]:
+def _separate_seconds(overlap: float) -> float:
+    """Windows that are counted: two dozen or more, not so short that noise hides their peaks."""
+    return float(np.clip(overlap / 24, 0.25, 1.0))
+
+
+def _inliers(
+    windows: Sequence[DelayWindow], line: tuple[float, float], tolerance_s: float = _TOLERANCE_S
+) -> tuple[list[DelayWindow], Floats]:
+    """The windows within `tolerance_s` of the line, and their delays from it."""
     residuals = np.array([w.delay_s - line[0] - (line[1] - 1) * w.time_s for w in windows])
-    near = np.abs(residuals) <= _TOLERANCE_S
+    near = np.abs(residuals) <= tolerance_s
     return [w for w, ok in zip(windows, near) if ok], residuals[near]
 
 
@@ -229,8 +339,30 @@ def _consensus(
     return float(support[winner]), _fit_line(times[near], delays[near], weights[near], rate_prior_sd)
 
 
-def _fit_line(times: Floats, delays: Floats, weights: Floats, rate_prior_sd: float) -> tuple[float, float]:
-    """(start, rate) by Tukey-weighted least squares, the slope shrunk towards zero drift (see the head of the file)."""
+@dataclass(frozen=True)
+class _Slope:
+    """A line through delays: `delay` at `time` (seconds) and its error, `drift` and the variance of its error."""
+
+    delay: float
+    time: float
+    drift: float
+    delay_sd: float
+    error_variance: float
+
+    def shrunk(self, rate_prior_sd: float) -> float:
+        """The drift shrunk towards zero by Bayes' rule for two Gaussians."""
+        return self.drift * rate_prior_sd**2 / (rate_prior_sd**2 + self.error_variance)
+
+
+def _arrays(windows: Sequence[DelayWindow]) -> tuple[Floats, Floats, Floats]:
+    """Times, delays and weights of windows."""
+    times = np.array([window.time_s for window in windows])
+    delays = np.array([window.delay_s for window in windows])
+    return times, delays, np.array([max(window.prominence - 1.0, 1e-3) for window in windows])
+
+
+def _slope(times: Floats, delays: Floats, weights: Floats) -> _Slope:
+    """The line by Tukey-weighted least squares, and what paths that change leave unknown (see the head of the file)."""
     robust = np.ones_like(delays)
     for _ in range(20):
         w = robust * weights
@@ -242,9 +374,16 @@ def _fit_line(times: Floats, delays: Floats, weights: Floats, rate_prior_sd: flo
         residuals = delays - middle - slope * (times - centre)
         sigma = max(1.4826 * float(np.median(np.abs(residuals))), 1e-5)
         robust = np.clip(1 - (residuals / (4.685 * sigma)) ** 2, 1e-3, 1) ** 2
-    error_variance = (sigma**2 * float((w**2).sum()) + PATH_SD_S**2) / variance if variance > 0 else np.inf
-    slope *= rate_prior_sd**2 / (rate_prior_sd**2 + error_variance)
-    return float(middle - slope * centre), float(1 + slope)
+    delay_variance = sigma**2 * float((w**2).sum()) + PATH_SD_S**2
+    error_variance = delay_variance / variance if variance > 0 else np.inf
+    return _Slope(float(middle), float(centre), float(slope), float(np.sqrt(delay_variance)), float(error_variance))
+
+
+def _fit_line(times: Floats, delays: Floats, weights: Floats, rate_prior_sd: float) -> tuple[float, float]:
+    """(start, rate) of the line, the slope shrunk towards zero drift."""
+    fit = _slope(times, delays, weights)
+    drift = fit.shrunk(rate_prior_sd)
+    return fit.delay - drift * fit.time, 1 + drift
 
 
 def sequence_sync_rms(

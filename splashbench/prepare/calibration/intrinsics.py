@@ -13,7 +13,8 @@ deviation comes from leaving out whole views in turn (jackknife; Efron and Stein
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -36,6 +37,7 @@ CORNER_OUTLIER_FACTOR = 4.0  # of normal errors one in 60 000 lies further off t
 MAX_TRIMS = 5
 SIGNIFICANT = 3.0  # standard deviations
 COVERAGE_CELLS = (8, 6)  # columns, rows
+BLANK_EVERY, MAX_BLANK = 3, 8  # of the frames without a board, those that are looked at in a mirror
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class Calibration:
     n_views: int
     view_points: Array  # [N, 2] pixels of all corners used, for the report
     n_outlier_corners: int = 0  # single corners of the views used that were left out: hidden by glare or a finger
+    # [9, 9] of fx, fy, cx, cy, k1, k2, p1, p2, k3: zero where held fixed, infinite where undetermined
+    lens_covariance: Array = field(default_factory=lambda: np.zeros((9, 9)))
 
 
 def frames_to_search(n_frames: int) -> list[int]:
@@ -67,6 +71,7 @@ def calibrate(images: Iterable[NDArray[np.uint8]], detector: Detector, source: s
     Raises SplashbenchError where the board is seen in fewer than five usable views.
     """
     views: list[BoardView] = []
+    blank: list[NDArray[np.uint8]] = []
     size = (0, 0)
     n_searched = n_replaced = 0
     for image in images:
@@ -74,13 +79,25 @@ def calibrate(images: Iterable[NDArray[np.uint8]], detector: Detector, source: s
         size = image_size(image)
         view = detector.detect(image)
         if view is None:
+            if n_searched % BLANK_EVERY == 1 and len(blank) < MAX_BLANK:
+                blank.append(image)
             continue
         if not view.lies_on_a_plane(size) and (true_view := detector.detect_true(image)) is not None:
             n_replaced += 1
             view = true_view
         views.append(view)
+    if len(views) < MIN_VIEWS and _is_mirrored(blank, detector):
+        raise SplashbenchError(
+            f"{source}: the board is seen mirrored, and its markers cannot be read; the video is flipped, or the board"
+            " was printed mirrored: switch flipping off in the camera, or print the board again, and film it again"
+        )
     calibration = calibrate_views(views, detector, size, source, n_searched)
     return replace(calibration, n_false=calibration.n_false + n_replaced)
+
+
+def _is_mirrored(images: list[NDArray[np.uint8]], detector: Detector) -> bool:
+    """Whether images in which no board was found show one in a mirror."""
+    return sum(detector.detect_true(np.ascontiguousarray(image[:, ::-1])) is not None for image in images) >= 2
 
 
 def calibrate_views(
@@ -111,6 +128,7 @@ def calibrate_views(
         n_views=len(used),
         view_points=pixels,
         n_outlier_corners=sum(len(chosen[index].ids) - len(trimmed[index].ids) for index in inliers),
+        lens_covariance=fit.covariance,
     )
 
 
@@ -170,6 +188,7 @@ class _Fit:
     lens: Lens
     rms: float
     focal_sigma: float
+    covariance: Array  # [9, 9]
     view_errors: Array  # [V] RMS, pixels
     corner_errors: list[Array]  # [N] per view, pixels
 
@@ -192,12 +211,13 @@ def _fit(views: list[BoardView], size: tuple[int, int], fixed: int = 0) -> _Fit:
         error = pixels - projected.reshape(-1, 2)
         errors.append(np.linalg.norm(error, axis=1).astype(np.float64))
         per_view.append((error.astype(np.float64).ravel(), np.asarray(jacobian, np.float64)[:, :15]))
-    deviations = _deviations(per_view, _free_columns(fixed))
+    covariance = _covariance(per_view, _free_columns(fixed))
+    deviations = np.sqrt(np.diag(covariance))
     if not fixed and abs(np.ravel(distortion)[4]) < SIGNIFICANT * deviations[8]:
         return _fit(views, size, cv2.CALIB_FIX_K3)
     lens = Lens.from_opencv(size[0], size[1], K, distortion)
     focal_sigma = float(np.sqrt(np.mean(deviations[:2] ** 2)))
-    return _Fit(lens, float(rms), focal_sigma, np.array([np.sqrt(np.mean(e**2)) for e in errors]), errors)
+    return _Fit(lens, float(rms), focal_sigma, covariance, np.array([np.sqrt(np.mean(e**2)) for e in errors]), errors)
 
 
 def _free_columns(fixed: int) -> list[int]:
@@ -213,11 +233,12 @@ def _free_columns(fixed: int) -> list[int]:
     return [column for column in range(9) if column not in fixed_columns]
 
 
-def _deviations(per_view: list[tuple[Array, Array]], free: list[int]) -> Array:
-    """Standard deviations [9] of fx, fy, cx, cy, k1, k2, p1, p2, k3: zero where fixed, infinite where undetermined.
+def _covariance(per_view: list[tuple[Array, Array]], free: list[int]) -> Array:
+    """Covariance [9, 9] of fx, fy, cx, cy, k1, k2, p1, p2, k3: zero where fixed, infinite where undetermined.
 
-    `per_view`: errors [2N] and their derivatives [2N, 15] by the view's pose (6) and by the lens (9). The larger of two
-    estimates: with errors independent from corner to corner, and the jackknife over views, linearised at the optimum.
+    `per_view`: errors [2N] and their derivatives [2N, 15] by the view's pose (6) and by the lens (9). A variance is the
+    larger of two estimates: with errors independent from corner to corner, and the jackknife over views, linearised at
+    the optimum. Correlations are the first estimate's: views are too few to estimate 36 of them.
     """
     normals, gradients = [], []
     squares, freedom = 0.0, -len(free)
@@ -231,19 +252,25 @@ def _deviations(per_view: list[tuple[Array, Array]], free: list[int]) -> Array:
         gradients.append(lens.T @ residual)
         squares += float(residual @ residual)
         freedom += len(error) - 6
-    result = np.zeros(9)
+    result = np.zeros((9, 9))
     count, information = len(per_view), np.sum(normals, axis=0)
     try:
-        inverse = np.diag(np.linalg.inv(information))
+        full = np.linalg.inv(information)
+        inverse = np.diag(full)
         shifts = np.array(
             [np.linalg.solve(information - part, -gradient) for part, gradient in zip(normals, gradients)]
         )
     except np.linalg.LinAlgError:
-        result[free] = np.inf
+        result[free, free] = np.inf
         return result
     independent = np.where(inverse > 0, inverse, np.inf) * (squares / max(freedom, 1))
     jackknife = (count - 1) / count * ((shifts - shifts.mean(0)) ** 2).sum(0)
-    result[free] = np.sqrt(np.maximum(independent, jackknife))
+    deviations = np.sqrt(np.maximum(independent, jackknife))
+    if not np.isfinite(deviations).all():
+        result[free, free] = deviations**2
+        return result
+    scale = deviations / np.sqrt(inverse)
+    result[np.ix_(free, free)] = full * scale[:, None] * scale
     return result
 
 
@@ -307,7 +334,8 @@ def _require(n_views: int, detector: Detector, source: str, n_searched: int) -> 
     if n_views < MIN_VIEWS:
         layout = detector.layout
         kind = "checkerboard" if layout.kind == "checkerboard" else "ChArUco board"
+        searched, again = ("photographs", "take photographs of") if Path(source).is_dir() else ("frames", "film")
         raise SplashbenchError(
             f"{source}: the {layout.squares_x}x{layout.squares_y} {kind} is usable in {n_views} of {n_searched}"
-            f" frames, {MIN_VIEWS} are needed; check [board] in session.toml, or film the board again"
+            f" {searched}, {MIN_VIEWS} are needed; check [board] in session.toml, or {again} the board again"
         )

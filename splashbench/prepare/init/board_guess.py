@@ -1,13 +1,16 @@
-"""Which ChArUco board was filmed: dictionary, squares and layout, found by trying; its size has to be measured.
+"""Which board was filmed: its kind, dictionary, squares and layout, found by trying; its size has to be measured.
 
 A board of w x h squares carries floor(w h / 2) markers, numbered from 0, so the largest number seen leaves few sizes.
-The right one is that whose corners OpenCV finds most of, on a plane in perspective.
+The right one is that whose corners OpenCV finds most of, on a plane in perspective. A board without markers may be a
+plain checkerboard (`checkerboard_guess`). A board whose markers can be read only in a mirror was filmed or printed
+mirrored.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 
 from splashbench.prepare.calibration.board import BoardView
 from splashbench.prepare.calibration.lens import OPENCV_PIXEL_SHIFT
+from splashbench.prepare.init.checkerboard_guess import guess_squares
 from splashbench.prepare.init.inspection import MarkerFinder, Markers
 
 WIDTH = 1280  # enough to read markers by, and quick
@@ -28,14 +32,20 @@ _MIN_CORNERS = 4
 
 @dataclass(frozen=True)
 class BoardGuess:
-    """A board as session.toml describes it, but for its size. `marker_share`: a marker's side over a square's."""
+    """A board as session.toml describes it, but for its size. `marker_share`: a marker's side over a square's.
+
+    `mirrored`: its markers are read only in a mirror. A checkerboard has neither `dictionary` nor `marker_share`, and
+    what is mirrored or inverted about it cannot be seen.
+    """
 
     squares_x: int
     squares_y: int
-    dictionary: str
+    dictionary: str | None
     legacy: bool
     inverted: bool
-    marker_share: float
+    marker_share: float | None
+    kind: Literal["charuco", "checkerboard"] = "charuco"
+    mirrored: bool = False
 
 
 @dataclass(frozen=True)
@@ -47,8 +57,20 @@ class _Picture:
 
 
 def guess_board(images: Sequence[NDArray[np.uint8]]) -> BoardGuess | None:
-    """The ChArUco board seen in images [H, W] grey; None where no marker pattern explains them."""
+    """The board seen in images [H, W] grey; None where none explains them."""
     shrunk = [_shrunk(image) for image in images]
+    guess = _guess_charuco(shrunk)
+    if guess is not None:
+        return guess
+    guess = _guess_charuco([np.ascontiguousarray(image[:, ::-1]) for image in shrunk])
+    if guess is not None:
+        return replace(guess, mirrored=True)
+    squares = guess_squares(shrunk)
+    return None if squares is None else BoardGuess(*squares, None, False, False, None, "checkerboard")
+
+
+def _guess_charuco(shrunk: Sequence[NDArray[np.uint8]]) -> BoardGuess | None:
+    """The ChArUco board; None where no marker pattern explains the images."""
     finder = MarkerFinder()
     if shrunk:
         finder.settle(shrunk)
@@ -96,6 +118,8 @@ def _shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _corners(picture: _Picture, guess: BoardGuess) -> BoardView | None:
     """The board's corners in a picture, if it is this board."""
+    assert guess.dictionary is not None
+    assert guess.marker_share is not None
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, guess.dictionary))
     board = cv2.aruco.CharucoBoard((guess.squares_x, guess.squares_y), 1.0, guess.marker_share, dictionary)
     board.setLegacyPattern(guess.legacy)

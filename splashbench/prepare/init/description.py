@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from dataclasses import replace as replace_
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,10 @@ from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_text
 from splashbench.prepare.init.board_guess import BoardGuess, guess_board
-from splashbench.prepare.init.discovery import FoundRecording, Subject, cameras_of, find_recordings
+from splashbench.prepare.init.discovery import FoundRecording, Subject, cameras_of, find_recordings, strays
 from splashbench.prepare.init.inspection import Inspection, MarkerFinder, assign, few_frames, inspect_recording
 from splashbench.prepare.session import DESCRIPTION
-from splashbench.prepare.video.recording import Recording
+from splashbench.prepare.video.stills import open_recording
 from splashbench.progress import track
 
 _HELD_OUT_SHARE = 2 / 7  # the paper holds out two of seven cameras
@@ -52,6 +53,8 @@ def describe(folder: Path, square_metres: float | None = None, replace: bool = F
     if path.exists() and not replace:
         raise SplashbenchError(f"{path} exists already; edit it, or --replace to write it anew")
     recordings = _with_subjects(folder, find_recordings(folder))
+    no_cameras = strays(recordings)
+    recordings = [replace_(r, subject=None) if r.camera in no_cameras else r for r in recordings]
     cameras = cameras_of(recording for recording in recordings if recording.subject is not None)
     if len(cameras) < 2:
         raise SplashbenchError(
@@ -60,6 +63,10 @@ def describe(folder: Path, square_metres: float | None = None, replace: bool = F
         )
     board = guess_board(_board_images(folder, recordings))
     text, to_do = _text(folder, recordings, cameras, board, square_metres)
+    to_do += [
+        f"{camera or 'a video'} was not taken for a camera: {reason}; if it is one, add it to session.toml"
+        for camera, reason in no_cameras.items()
+    ]
     write_text(path, text)
     return Description(tuple(recordings), tuple(cameras), board, tuple(to_do), path)
 
@@ -71,7 +78,7 @@ def _with_subjects(folder: Path, recordings: list[FoundRecording]) -> list[Found
     finder = MarkerFinder()
     board = next((recording for recording in recordings if recording.subject == "intrinsics"), None)
     if unnamed and board is not None:  # sooner here than by trying every kind of marker on recordings without any
-        finder.settle(few_frames(Recording([folder / name for name in board.files])))
+        finder.settle(few_frames(open_recording([folder / name for name in board.files])))
     for recording in track(unnamed, "looking at videos"):
         inspections[recording.files] = inspect_recording([folder / name for name in recording.files], finder)
     by_camera: dict[str, list[FoundRecording]] = {}
@@ -99,7 +106,9 @@ def _one_of_each(folder: Path, recordings: list[FoundRecording]) -> list[FoundRe
 
 
 def _bytes(folder: Path, recording: FoundRecording) -> int:
-    return sum((folder / name).stat().st_size for name in recording.files)
+    paths = [folder / name for name in recording.files]
+    files = [file for path in paths for file in (path.iterdir() if path.is_dir() else [path])]
+    return sum(file.stat().st_size for file in files)
 
 
 def _board_images(folder: Path, recordings: Sequence[FoundRecording]) -> list[NDArray[np.uint8]]:
@@ -107,7 +116,7 @@ def _board_images(folder: Path, recordings: Sequence[FoundRecording]) -> list[ND
     clip = next((recording for recording in recordings if recording.subject == "intrinsics"), None)
     if clip is None:
         return []
-    video = Recording([folder / name for name in clip.files])
+    video = open_recording([folder / name for name in clip.files])
     count = len(video.frame_times)
     indices = np.unique(np.linspace(0, count - 1, min(count, _BOARD_FRAMES)).astype(int)).tolist()
     return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for _, image in video.frames(indices)]
@@ -142,9 +151,15 @@ def _text(
     ]
     blocks.append(_board_text(board, square_metres))
     if board is None:
-        to_do.append("describe the ChArUco board under [board]: none was recognised")
+        to_do.append("describe the board under [board]: none was recognised, neither ChArUco nor checkerboard")
     elif square_metres is None:
-        to_do.append("measure one printed square and set square_metres and marker_metres under [board]")
+        markers = " and marker_metres" if board.kind == "charuco" else ""
+        to_do.append(f"measure one printed square and set square_metres{markers} under [board]")
+    if board is not None and board.mirrored:
+        to_do.append(
+            "the board is seen mirrored: the videos are flipped, or it was printed mirrored; switch flipping off in the"
+            " camera, or print the board again, and film once more"
+        )
     files_of = {
         subject: {recording.camera: list(recording.files) for recording in recordings if recording.subject == subject}
         for subject in _SUBJECTS
@@ -157,26 +172,37 @@ def _text(
             to_do.append(
                 f"no {subject} recording was recognised for camera {', '.join(missing)}: add [recordings.{subject}]"
             )
-    sweep = [recording for recording in recordings if recording.subject == "sweep"]
+    # One that its name calls a sweep before one that merely moves, such as a film of the people at work.
+    sweep = sorted((r for r in recordings if r.subject == "sweep"), key=lambda r: (r.camera != "", -_bytes(folder, r)))
     if sweep:
         blocks.append(toml.dumps({"sweep": {"files": list(sweep[0].files)}}))
+        if len(sweep) > 1:
+            to_do.append(f"{len(sweep)} recordings move like a sweep; check that {sweep[0].files[0]} is the right one")
     else:
         to_do.append("no handheld sweep was found; without one the cameras must share enough of the scene")
     blocks.append(toml.dumps({"masks": {"provider": "background"}}))
-    unused = [name for recording in [*recordings, *sweep[1:]] if recording.subject is None for name in recording.files]
+    left = [recording for recording in recordings if recording.subject is None]
+    unused = [name for recording in [*left, *sweep[1:]] for name in recording.files]
     if unused:
         blocks.append("# Not used:\n" + "".join(f"#   {name}\n" for name in unused))
-        to_do.append(f"{len(unused)} videos are not used; they are listed at the end of {DESCRIPTION}")
+        to_do.append(f"{len(unused)} recordings are not used; they are listed at the end of {DESCRIPTION}")
     return "\n".join(blocks), to_do
 
 
 def _board_text(board: BoardGuess | None, square_metres: float | None) -> str:
     if board is None:
         return (
-            "# [board]                       # the ChArUco board that was filmed\n"
+            "# [board]                       # the board that was filmed: a ChArUco board\n"
+            '# kind = "charuco"              # or "checkerboard", then without marker_metres and dictionary\n'
             "# squares_x = 8\n# squares_y = 5\n# square_metres = 0.03\n# marker_metres = 0.0225\n"
             '# dictionary = "DICT_4X4_50"\n'
         )
+    if board.kind == "checkerboard":
+        text = toml.dumps({"board": {"kind": board.kind, "squares_x": board.squares_x, "squares_y": board.squares_y}})
+        if square_metres is None:
+            return text + "# square_metres =               # measure the side of one printed square, in metres\n"
+        return text + f"square_metres = {square_metres}\n"
+    assert board.marker_share is not None
     text = toml.dumps(
         {
             "board": {

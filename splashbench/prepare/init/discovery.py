@@ -3,7 +3,10 @@
 Cameras write GX010003.MP4, GX020003.MP4, ...: chapters 1, 2, ... of recording 3 (GH, GL, GP and GOPR likewise, GoPro's
 "Camera File Chaptering Information"). A camera is known by the folder its files lie in, or by what stands before the
 camera's own name (cam1_GX010003.MP4); what was filmed, from words such as "pour" or "static" in either. What the names
-leave open stays open here: `inspection` looks at the frames.
+leave open stays open here: `inspection` looks at the frames. A folder that holds photographs and no videos is one
+recording.
+
+Not every folder is a camera's. Exports, backups and films of the people at work lie beside them (`strays`).
 """
 
 from __future__ import annotations
@@ -16,15 +19,14 @@ from pathlib import Path
 from typing import Literal
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.video.chapters import split_name
 
 Subject = Literal["intrinsics", "static", "pour", "sweep"]
 
 _VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".360")
 _LEFT_OUT = ("truth", "prepare", "masks")  # folders that hold no recordings of the session
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 _MAX_FILES = 10_000
-_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*(?:G[HXLS](?P<chapter>\d{2})(?P<number>\d{4}))$", re.IGNORECASE)
-_FIRST_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*GOPR(?P<number>\d{4})$", re.IGNORECASE)
-_LATER_CHAPTER = re.compile(r"^(?P<before>.*?)[ _.-]*GP(?P<chapter>\d{2})(?P<number>\d{4})$", re.IGNORECASE)
 _WORDS: dict[Subject, tuple[str, ...]] = {
     "intrinsics": ("intrinsics", "intrinsic", "calibration", "calib", "board", "charuco", "checkerboard", "lens"),
     "static": ("static", "background", "empty", "extrinsics", "extrinsic", "poses"),
@@ -55,13 +57,18 @@ def find_recordings(folder: Path) -> list[FoundRecording]:
     chapters: dict[tuple[str, str, str], list[tuple[int, str]]] = {}
     for path in _video_files(folder):
         relative = path.relative_to(folder)
-        before, number, chapter = _split(path.stem)
+        before, number, chapter = split_name(path.stem)
         chapters.setdefault((relative.parent.as_posix(), before, number), []).append((chapter, relative.as_posix()))
     if not chapters:
         raise SplashbenchError(
             f"{folder}: no video in it or below it; copy the cameras' files there ({', '.join(_VIDEOS)})"
         )
     recordings = []
+    for photographs in _photograph_folders(folder):
+        name = photographs.relative_to(folder).as_posix()
+        camera, subject = _camera_and_subject(name.split("/"))
+        if subject != "pour":
+            recordings.append(FoundRecording((name,), camera, subject))
     for (parent, before, number), files in chapters.items():
         # A name that is not a camera's own may itself say what was filmed.
         words = [*([] if parent == "." else parent.split("/")), before if number else files[0][1].split("/")[-1][:-4]]
@@ -84,14 +91,46 @@ def _video_files(folder: Path) -> list[Path]:
     return files
 
 
-def _split(stem: str) -> tuple[str, str, int]:
-    """What stands before a camera's own name, the recording's number in it ("" without one) and the chapter."""
-    for pattern in (_CHAPTER, _FIRST_CHAPTER, _LATER_CHAPTER):
-        match = pattern.match(stem)
-        if match:
-            groups = match.groupdict()
-            return groups["before"], groups["number"], int(groups.get("chapter") or 0)
-    return stem, "", 0
+def _photograph_folders(folder: Path) -> list[Path]:
+    """Folders that hold photographs and no videos."""
+    found: list[Path] = []
+    for root, folders, names in os.walk(folder):
+        top = Path(root) == Path(folder)
+        folders[:] = sorted(
+            name
+            for name in folders
+            if not name.startswith(".") and not (top and any(word in name.lower() for word in _LEFT_OUT))
+        )
+        visible = [name.lower() for name in names if not name.startswith(".")]
+        if not top and not any(name.endswith(_VIDEOS) for name in visible):
+            found += [Path(root)] if any(name.endswith(_PHOTOGRAPHS) for name in visible) else []
+    return found
+
+
+def strays(recordings: Sequence[FoundRecording]) -> dict[str, str]:
+    """Names that were taken for cameras and are none, with the reason.
+
+    A camera of a session has most of board, static scene and pour. Where others have two of them, one that has a single
+    one is no camera; nor is a folder within a camera's folder, or what lies in no folder at all.
+    """
+    subjects: dict[str, set[Subject]] = {}
+    for recording in recordings:
+        if recording.subject != "sweep" or recording.camera:
+            subjects.setdefault(recording.camera, set()).update({recording.subject} if recording.subject else set())
+    complete = [camera for camera, seen in subjects.items() if len(seen) >= 2]
+    found: dict[str, str] = {}
+    if len(complete) < 2:
+        return found
+    for camera, seen in subjects.items():
+        parent = next((other for other in complete if other != camera and camera.startswith(f"{other}-")), None)
+        if not camera:
+            found[camera] = "it lies in no camera's folder"
+        elif parent is not None:
+            found[camera] = f"it lies within the folder of camera {parent}"
+        elif len(seen) < 2 and seen != {"sweep"}:
+            only = f"only {' '.join(seen)}" if seen else "nothing that is known"
+            found[camera] = f"it shows {only}, other cameras have {max(map(len, subjects.values()))} recordings"
+    return found
 
 
 def _camera_and_subject(words: Sequence[str]) -> tuple[str, Subject | None]:

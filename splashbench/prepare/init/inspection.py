@@ -1,7 +1,8 @@
 """What a recording shows, where its name does not say: the board waved about, a scene at rest, liquid, a sweep.
 
-A few small frames decide. A clip in which markers are seen and travel is for the lens. One in which nothing changes is
-the static scene. A camera that itself travels is the sweep. Of what is left, the longest is the pour.
+A few small frames decide. A clip in which a board's markers, or a checkerboard, are seen and travel is for the lens.
+One in which nothing changes is the static scene. A camera that itself travels is the sweep. Of what is left, the
+longest is the pour.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.prepare.init.checkerboard_guess import board_corners
 from splashbench.prepare.init.discovery import FoundRecording, Subject, with_subject
 from splashbench.prepare.video.recording import Recording
+from splashbench.prepare.video.stills import Stills, open_recording
 
 FRAMES = 9
 WIDTH = 640
@@ -36,8 +39,8 @@ class Inspection:
     """What a few frames of a recording show.
 
     Attributes:
-        seconds: how long it lasts.
-        marker_share: of the frames, those that show markers.
+        seconds: how long it lasts; 0 for photographs.
+        marker_share: of the frames, those that show markers, or a checkerboard.
         marker_travel: how far the markers' middle wanders, image widths.
         change: mean change of a pixel between the first and the others, grey levels of 255.
         shift: of the whole picture from one frame to the next, median, image widths.
@@ -50,7 +53,7 @@ class Inspection:
     shift: float
 
 
-def few_frames(recording: Recording) -> list[NDArray[np.uint8]]:
+def few_frames(recording: Recording | Stills) -> list[NDArray[np.uint8]]:
     """A few grey frames [H, W] of a recording, small and spread evenly."""
     count = len(recording.frame_times)
     indices = np.unique(np.linspace(0, count - 1, FRAMES).astype(int)).tolist()
@@ -59,17 +62,19 @@ def few_frames(recording: Recording) -> list[NDArray[np.uint8]]:
 
 def inspect_recording(paths: Sequence[Path], finder: MarkerFinder) -> Inspection:
     """Inspection at a recording. Raises SplashbenchError where it cannot be read."""
-    recording = Recording(paths)
+    recording = open_recording(paths)
     images = few_frames(recording)
     if finder.dictionary is None:
         finder.settle(images)
-    middles = [middle for middle in (_marker_middle(finder.find(image)) for image in images) if middle is not None]
+    settled = finder.dictionary is not None
+    seen = [_marker_middle(finder.find(image)) if settled else _checkerboard_middle(image) for image in images]
+    middles = [middle for middle in seen if middle is not None]
     travel = float(np.ptp(np.array(middles), axis=0).max()) / WIDTH if len(middles) > 1 else 0.0
     first = images[0].astype(np.float32)
     change = max((float(np.abs(image.astype(np.float32) - first).mean()) for image in images[1:]), default=0.0)
     shifts = [_shift(a, b) for a, b in pairwise(images)]
     return Inspection(
-        seconds=recording.info.duration,
+        seconds=recording.info.duration if isinstance(recording, Recording) else 0.0,
         marker_share=len(middles) / len(images),
         marker_travel=travel,
         change=change,
@@ -138,6 +143,12 @@ def _marker_middle(markers: Markers) -> NDArray[np.float64] | None:
     return np.asarray(markers.corners.reshape(-1, 2).mean(0), np.float64)
 
 
+def _checkerboard_middle(image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+    """Mean place of a checkerboard's corners, pixels [2]; None where there is none."""
+    corners = board_corners(image)
+    return None if corners is None else np.asarray(corners.reshape(-1, 2).mean(0), np.float64)
+
+
 def _shift(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
     """How far the whole picture moved, in image widths, by phase correlation."""
     window = cv2.createHanningWindow((a.shape[1], a.shape[0]), cv2.CV_32F)
@@ -174,5 +185,6 @@ def assign(
     take("intrinsics", sorted(waved, key=lambda f: -inspection(f).marker_share * inspection(f).marker_travel))
     still = [f for f in undecided if inspection(f).change < _STILL_GREY]
     take("static", sorted(still, key=lambda f: inspection(f).change))
-    take("pour", sorted(undecided, key=lambda f: -inspection(f).seconds))
+    # Photographs have no clock: they never show the pour.
+    take("pour", sorted((f for f in undecided if inspection(f).seconds > 0), key=lambda f: -inspection(f).seconds))
     return [*named, *undecided]

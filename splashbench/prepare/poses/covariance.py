@@ -1,7 +1,12 @@
 """How sure structure from motion is of each camera: standard deviations of centres and rotations.
 
 The inverse of the bundle adjustment's normal equations is the covariance of its poses (Triggs et al., "Bundle
-adjustment: a modern synthesis", 1999, Sec. 9). It is scaled by the residuals' variance instead of an assumed pixel.
+adjustment: a modern synthesis", 1999, Sec. 9), where all observations have one noise. Here each image counts with the
+noise of its own residuals (White, Econometrica 48(4), 1980), and nothing is assumed of a pixel.
+
+Lenses that are held fixed are not known exactly. A focal length that is off by a thousandth moves its camera by a
+thousandth of its distance, without any residual. On a synthetic session that made centres err by six times what the
+features' noise explains. So the covariance of the calibrated lenses is carried over to the poses, and given besides.
 
 A reconstruction is free by a similarity, so a covariance depends on the gauge. COLMAP's gauge fixes two cameras, which
 then seem exact and make the others seem worse. Here the gauge is the fixed cameras' mean. A deviation is what remains
@@ -12,7 +17,7 @@ distance answers (`scale`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +27,8 @@ from splashbench.colmap import pycolmap
 from splashbench.prepare.calibration.lens import Array
 
 _STEP = 1e-6  # of central differences, relative to the depth or to the parameter
+_MANY = 50.0  # degrees of freedom by which an image's noise is known to a tenth
+_MOST = 100.0  # of the variance of all, that is believed of an image with fewer
 # Of each model's parameters, the principal point's, which bundle adjustment does not always refine.
 _PRINCIPAL = {"FULL_OPENCV": (2, 3), "OPENCV": (2, 3), "SIMPLE_RADIAL": (1, 2)}
 
@@ -30,11 +37,14 @@ _PRINCIPAL = {"FULL_OPENCV": (2, 3), "OPENCV": (2, 3), "SIMPLE_RADIAL": (1, 2)}
 class PoseSigmas:
     """Root mean square errors to expect by image name, over all three axes together.
 
-    Centres in units of the reconstruction, rotations in degrees.
+    Centres in units of the reconstruction, rotations in degrees. `feature_centre`, `feature_rotation_deg`: by the noise
+    of the features alone, as if the fixed lenses were exact.
     """
 
     centre: dict[str, float] = field(default_factory=dict)
     rotation_deg: dict[str, float] = field(default_factory=dict)
+    feature_centre: dict[str, float] = field(default_factory=dict)
+    feature_rotation_deg: dict[str, float] = field(default_factory=dict)
 
 
 def pose_sigmas(
@@ -42,54 +52,88 @@ def pose_sigmas(
     names: Sequence[str],
     fixed_lenses: Set[int],
     principal_point_refined: bool = False,
+    lens_covariance: Mapping[int, Array] | None = None,
 ) -> PoseSigmas | None:
     """Standard deviations of the poses of the images `names`, relative to each other (see above).
 
     `fixed_lenses`: COLMAP's numbers of the cameras whose intrinsics were not refined; `principal_point_refined`:
-    whether that of the others was. None where fewer than two of the images have a pose, or where the observations do
-    not determine them.
+    whether that of the others was. `lens_covariance`: of some of the fixed lenses, by COLMAP's number, [9, 9] for fx,
+    fy, cx, cy, k1, k2, p1, p2, k3; the others count as exact. None where fewer than two of the images have a pose, or
+    where the observations or the lenses do not determine them.
     """
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda i: i.name)
     chosen = [index for index, image in enumerate(images) if image.name in set(names)]
     if len(chosen) < 2 or not reconstruction.points3D:
         return None
-    normal, variance = _reduced_normal_matrix(reconstruction, images, fixed_lenses, principal_point_refined)
-    if normal is None:
+    system = _reduced_system(reconstruction, images, fixed_lenses, principal_point_refined, lens_covariance or {})
+    if system is None:
         return None
     centres = np.array([-_rotation(image).T @ _translation(image) for image in images])
     radius = float(np.sqrt(((centres[chosen] - centres[chosen].mean(0)) ** 2).sum(1).mean()))
     if radius <= 0:
         return None
-    generators = np.zeros((len(normal), 7))
+    generators = np.zeros((len(system.normal), 7))
     for index, image in enumerate(images):
-        generators[6 * index : 6 * index + 6] = _similarity_generators(_rotation(image), centres[index])
+        generators[6 * index : 6 * index + 6] = similarity_generators(_rotation(image), centres[index])
     try:
-        covariance = variance * _inverse_without_gauge(normal, generators)
+        inverse = inverse_without_gauge(system.normal, generators)
     except linalg.LinAlgError:
         return None
+    by_features = inverse @ system.noise(inverse) @ inverse
+    covariance = by_features + inverse @ system.lenses @ inverse
     rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in chosen])
-    free, gauge = covariance[np.ix_(rows, rows)], generators[rows]
+    gauge = generators[rows]
     weights = np.tile([1.0, 1.0, 1.0, *([1 / radius**2] * 3)], len(chosen))
     # What no similarity of the chosen cameras can take away.
     remain = np.eye(len(rows)) - gauge @ np.linalg.solve(gauge.T @ (weights[:, None] * gauge), gauge.T * weights)
-    deviations = np.diag(remain @ free @ remain.T).reshape(-1, 2, 3).sum(-1)
-    if not np.isfinite(deviations).all() or (deviations < 0).any():
-        return None
     labels = [images[index].name for index in chosen]
-    return PoseSigmas(
-        centre={name: float(np.sqrt(value)) for name, value in zip(labels, deviations[:, 1])},
-        rotation_deg={name: float(np.degrees(np.sqrt(value))) for name, value in zip(labels, deviations[:, 0])},
-    )
+    sigmas: list[dict[str, float]] = []
+    for of in (covariance, by_features):
+        squares = np.diag(remain @ of[np.ix_(rows, rows)] @ remain.T).reshape(-1, 2, 3).sum(-1)
+        if not np.isfinite(squares).all() or (squares < 0).any():
+            return None
+        sigmas.append({name: float(np.sqrt(value)) for name, value in zip(labels, squares[:, 1])})
+        sigmas.append({name: float(np.degrees(np.sqrt(value))) for name, value in zip(labels, squares[:, 0])})
+    return PoseSigmas(*sigmas)
 
 
-def _reduced_normal_matrix(
+@dataclass(frozen=True)
+class _System:
+    """The normal equations of poses (rotation, then centre, 6 each) and refined intrinsics, points eliminated.
+
+    Attributes:
+        normal: [M, M], J^T J.
+        per_image: of each image its share of `normal`; its residuals' squares, px^2; its number of coordinates; and how
+            many of these the points take up.
+        variance: of all residuals, per coordinate, px^2.
+        lenses: [M, M], what the uncertainty of the fixed lenses adds to the variance of the right side.
+    """
+
+    normal: Array
+    per_image: list[tuple[Array, float, int, float]]
+    variance: float
+    lenses: Array
+
+    def noise(self, inverse: Array) -> Array:
+        """[M, M]: variance of the right side by the noise of the features, each image's own."""
+        total = np.zeros_like(self.normal)
+        for share, squares, count, by_points in self.per_image:
+            # The unknowns fit themselves to the noise: what remains of it is less by its share of them.
+            freedom = count - by_points - float((share * inverse).sum())
+            own = squares / freedom if freedom > 0 else np.inf
+            # Of few residuals the variance is itself uncertain, and never taken for less than that of all.
+            total += (own if freedom >= _MANY else max(self.variance, min(own, _MOST * self.variance))) * share
+        return total
+
+
+def _reduced_system(
     reconstruction: pycolmap.Reconstruction,
     images: Sequence[pycolmap.Image],
     fixed_lenses: Set[int],
     principal_point_refined: bool,
-) -> tuple[Array | None, float]:
-    """J^T J of the poses (rotation, then centre, 6 each) and refined intrinsics, points eliminated; and the
-    residuals' variance per coordinate, px^2. No matrix where there are fewer observations than unknowns."""
+    lens_covariance: Mapping[int, Array],
+) -> _System | None:
+    """The system of all images; None where there are fewer observations than unknowns."""
     numbers = {key: index for index, key in enumerate(reconstruction.points3D)}
     refined: dict[int, tuple[int, list[int]]] = {}  # camera -> first column, its refined parameters
     n_columns = 6 * len(images)
@@ -99,8 +143,10 @@ def _reduced_normal_matrix(
         free = [index for index in range(len(camera.params)) if index not in principal]
         refined[camera_id] = (n_columns, free)
         n_columns += len(free)
-    rows, columns, values, point_rows, point_values, points, squares = [], [], [], [], [], [], 0.0
-    n_rows = 0
+    rows, columns, values, point_rows, point_values, points = [], [], [], [], [], []
+    squares: list[float] = []
+    lens_slopes: list[tuple[int, slice, Array]] = []  # COLMAP's camera, rows, derivatives by its lens
+    ends, n_rows = [], 0
     for index, image in enumerate(images):
         observed = [point for point in image.points2D if point.has_point3D()]
         if not observed:
@@ -109,10 +155,10 @@ def _reduced_normal_matrix(
         R, world = _rotation(image), np.array([reconstruction.points3D[p.point3D_id].xyz for p in observed])
         rotated = world @ R.T
         local = rotated + _translation(image)
-        squares += float(((_project(camera, local) - np.array([p.xy for p in observed])) ** 2).sum())
+        squares.append(float(((_project(camera, local) - np.array([p.xy for p in observed])) ** 2).sum()))
         d_local = _local_jacobian(camera, local)
         # A turn w of the camera moves a point by w x local when its centre stays; a step of its centre by -R step.
-        d_turn = -np.einsum("nij,njk->nik", d_local, _cross_matrices(local))
+        d_turn = -np.einsum("nij,njk->nik", d_local, cross_matrices(local))
         d_point = d_local @ R
         blocks = [(6 * index, d_turn), (6 * index + 3, -d_point)]
         if image.camera_id in refined:
@@ -127,10 +173,14 @@ def _reduced_normal_matrix(
         point_rows.append(own_rows)
         point_values.append(d_point)
         points.append([numbers[p.point3D_id] for p in observed])
+        if image.camera_id in lens_covariance:
+            slopes = _parameter_jacobian(camera, local, range(9)).reshape(-1, 9)
+            lens_slopes.append((image.camera_id, slice(n_rows, n_rows + len(slopes)), slopes))
         n_rows += 2 * len(observed)
+        ends.append(n_rows)
     unknowns = n_columns + 3 * len(numbers) - 7
     if n_rows <= unknowns:
-        return None, 0.0
+        return None
     J = sparse.csr_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(n_rows, n_columns)
     )
@@ -153,10 +203,25 @@ def _reduced_normal_matrix(
         shape=(n_rows, 3 * len(numbers)),
     )
     coupling = (J.T @ J_points).toarray()
-    return (J.T @ J).toarray() - coupling @ coupling.T, squares / (n_rows - unknowns)
+    normal, lenses = np.zeros((n_columns, n_columns)), np.zeros((n_columns, n_columns))
+    pushes = {camera_id: np.zeros((n_columns, 9)) for camera_id, _, _ in lens_slopes}
+    per_image = []
+    slopes_at = {rows.start: (camera_id, slopes) for camera_id, rows, slopes in lens_slopes}
+    for first, last, own_squares in zip([0, *ends], ends, squares):
+        reduced = J[first:last].toarray() - J_points[first:last] @ coupling.T  # what the points cannot account for
+        share = reduced.T @ reduced
+        by_points = float(J_points[first:last].power(2).sum())
+        per_image.append((share, own_squares, last - first, by_points))
+        normal += share
+        if first in slopes_at:
+            camera_id, slopes = slopes_at[first]
+            pushes[camera_id] += reduced.T @ slopes
+    for camera_id, push in pushes.items():
+        lenses += push @ lens_covariance[camera_id] @ push.T
+    return _System(normal, per_image, sum(squares) / (n_rows - unknowns), lenses)
 
 
-def _inverse_without_gauge(normal: Array, generators: Array) -> Array:
+def inverse_without_gauge(normal: Array, generators: Array) -> Array:
     """Inverse of the normal matrix, which is singular along the seven `generators`, in the gauge orthogonal to them.
 
     The columns are scaled to unit diagonal first: intrinsics and poses differ by many orders of magnitude.
@@ -171,11 +236,11 @@ def _inverse_without_gauge(normal: Array, generators: Array) -> Array:
     return np.asarray(inverse * scale[:, None] * scale)
 
 
-def _similarity_generators(R: Array, centre: Array) -> Array:
+def similarity_generators(R: Array, centre: Array) -> Array:
     """[6, 7]: how a camera's turn (in its own axes) and centre follow a turn, a growth and a step of the world."""
     generators = np.zeros((6, 7))
     generators[:3, :3] = -R
-    generators[3:, :3] = -_cross_matrices(centre[None])[0]
+    generators[3:, :3] = -cross_matrices(centre[None])[0]
     generators[3:, 3] = centre
     generators[3:, 4:] = np.eye(3)
     return generators
@@ -219,7 +284,7 @@ def _translation(image: pycolmap.Image) -> Array:
     return np.asarray(image.cam_from_world().translation, np.float64)
 
 
-def _cross_matrices(vectors: Array) -> Array:
+def cross_matrices(vectors: Array) -> Array:
     """[N, 3, 3], of which each times x is the cross product of a vector [N, 3] with x."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)

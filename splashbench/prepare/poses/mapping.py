@@ -48,6 +48,7 @@ class Workplace:
     names: Mapping[str, str]  # fixed camera -> image name
     fixed_lenses: frozenset[int]  # COLMAP's numbers of the cameras whose lens is known
     threads: int
+    swept: bool = False  # whether a sweep bridges the fixed cameras
 
     @property
     def database(self) -> Path:
@@ -64,9 +65,9 @@ class Mapped:
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """COLMAP logs hundreds of lines to standard error; only its errors stay."""
+    """COLMAP logs hundreds of lines to standard error, its errors among them: what went wrong, this program says."""
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     try:
         yield
     finally:
@@ -106,7 +107,7 @@ def match(
         focal = sweep_focal or DEFAULT_FOCAL * max(width, height)
         params = [focal, focal, width / 2, height / 2, 0.0, 0.0, 0.0, 0.0]
         extract(swept, pycolmap.CameraMode.SINGLE, SWEEP_MODEL, params)
-    workplace = Workplace(folder, names, _write_lenses(folder / "database.db", names, lenses), threads)
+    workplace = Workplace(folder, names, _write_lenses(folder / "database.db", names, lenses), threads, bool(sweep))
 
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
@@ -274,8 +275,11 @@ def require_posed(workplace: Workplace, mapped: Mapped | None) -> Mapped:
     posed = set() if mapped is None else {i.name for i in mapped.reconstruction.images.values() if i.has_pose}
     missing = sorted(camera for camera, name in workplace.names.items() if name not in posed)
     if mapped is None or missing:
+        if workplace.swept:
+            where, bridge = "sweep and static scene", "sweep slowly past the neighbours of these cameras"
+        else:
+            where, bridge = "static scene", "film a hand-held [sweep] past these cameras, which the session lacks"
         raise SplashbenchError(
-            f"sweep and static clips: no pose for camera {', '.join(missing)}; give the static scene more texture,"
-            " or sweep slowly past the neighbours of these cameras"
+            f"{where}: no pose for camera {', '.join(missing)}; give the static scene more texture, or {bridge}"
         )
     return mapped

@@ -117,7 +117,7 @@ def align_print(sightings: Sequence[Sighting], flat: Print, upright: bool = True
     numbers = sorted(number for number, rays in rays_of.items() if len(rays) >= 2)
     if len(numbers) < flat.needed:
         raise SplashbenchError(
-            f"static clips and sweep: {len(numbers)} corners of the {flat.name} are seen twice, {flat.needed} are"
+            f"static scene: {len(numbers)} corners of the {flat.name} are seen twice, {flat.needed} are"
             f" needed for metres and gravity; lay the {flat.name} flat where several cameras see it"
         )
     sfm = np.array(
@@ -139,7 +139,7 @@ def align_print(sightings: Sequence[Sighting], flat: Print, upright: bool = True
     heights = [float(-(pose[:3, :3].T @ pose[:3, 3])[1]) for pose in above]
     if upright and np.median(heights) <= 0:
         raise SplashbenchError(
-            f"static clips: the cameras come out below the {flat.name}; lay it face up, and {flat.remedy} in"
+            f"static scene: the cameras come out below the {flat.name}; lay it face up, and {flat.remedy} in"
             " session.toml"
         )
     rms = float(np.sqrt(np.mean(residual[inliers] ** 2)))
@@ -196,6 +196,7 @@ def transformed(poses: Poses, similarity: Similarity) -> Poses:
         sweep_w2c=np.array([similarity.apply_w2c(matrix) for matrix in poses.sweep_w2c]).reshape(-1, 4, 4),
         points=similarity.apply(poses.points),
         centre_sigma={camera: similarity.scale * sigma for camera, sigma in poses.centre_sigma.items()},
+        feature_centre_sigma={camera: similarity.scale * s for camera, s in poses.feature_centre_sigma.items()},
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardView, Detector
-from splashbench.prepare.calibration.checkerboard import board_detector, numbered_alike
+from splashbench.prepare.calibration.checkerboard import board_detector, like_turns, numbered_alike
 from splashbench.prepare.calibration.intrinsics import Calibration, calibrate, focal_guess, frames_to_search
-from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.calibration.lens import Array, Lens
 from splashbench.prepare.calibration.marker import MarkerDetector, is_on_board
 from splashbench.prepare.poses import metric, scale
 from splashbench.prepare.poses import structure_from_motion as poses
+from splashbench.prepare.poses.board_rig import board_poses
+from splashbench.prepare.poses.board_sightings import shared_sightings
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.video.recording import Recording
 from splashbench.prepare.video.stills import Stills, open_recording
@@ -29,7 +32,10 @@ SHARPNESS_WIDTH = 480
 
 @dataclass(frozen=True)
 class PosedRig:
-    """Poses in structure from motion's own units, and the prints of known size as the posed images show them."""
+    """Poses and the prints of known size as the posed images show them.
+
+    The poses are in units of their own; in metres where a board that several cameras see at once placed them.
+    """
 
     poses: poses.Poses
     board: tuple[metric.Sighting, ...]
@@ -59,7 +65,22 @@ class RigRecordings:
         self.boards = {camera: open_recording(session.paths("intrinsics", camera)) for camera in session.cameras}
         self.static = {camera: open_recording(session.paths("static", camera)) for camera in session.cameras}
         self.sweep = open_recording(session.sweep_paths) if session.sweep_paths else None
+        self.extrinsics = {
+            camera: open_recording(session.paths("extrinsics", camera))
+            for camera in (session.cameras if session.recordings.extrinsics else ())
+        }
+        if self.extrinsics and len(like_turns(session.board)) > 1:
+            raise SplashbenchError(
+                f"{session.directory / DESCRIPTION}: the checkerboard looks the same after a half turn, so"
+                " [recordings.extrinsics] cannot tell how cameras see it; use one with an odd and an even number of"
+                " squares, or a ChArUco board"
+            )
         self._sharpness: list[float] | None = None  # of all frames of the sweep, once they have been looked at
+
+    def videos(self) -> list[Recording]:
+        """Every recording that is no photographs."""
+        opened = [*self.boards.values(), *self.static.values(), *self.extrinsics.values(), self.sweep]
+        return [recording for recording in opened if isinstance(recording, Recording)]
 
     def calibrate(self, camera: str) -> Calibration:
         """One camera's lens from its board clip."""
@@ -70,12 +91,14 @@ class RigRecordings:
 
     def static_images(self) -> dict[str, Image]:
         """One picture of the static scene per camera, the median over its clip."""
-        images = {}
-        for camera, recording in self.static.items():
-            count = len(recording.frame_times)
-            indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
-            images[camera] = poses.static_image([frame for _, frame in recording.frames(indices)])
-        return images
+        return {camera: self.static_image(camera) for camera in self.static}
+
+    def static_image(self, camera: str) -> Image:
+        """One camera's picture of the static scene [H, W, 3], the median over its clip."""
+        recording = self.static[camera]
+        count = len(recording.frame_times)
+        indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
+        return poses.static_image([frame for _, frame in recording.frames(indices)])
 
     def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> list[Image]:
         """The `count` sharpest frames of the sweep, spread over it; none where there is no sweep."""
@@ -86,15 +109,22 @@ class RigRecordings:
         chosen = poses.sharpest_per_bin(self._sharpness, count)
         return [frame for _, frame in self.sweep.frames(chosen)]
 
-    def pose(self, lenses: Mapping[str, Lens], work: Path) -> PosedRig:
-        """Structure from motion of the static scene, and where it shows the board; `work` is an empty folder."""
+    def pose(
+        self, lenses: Mapping[str, Lens], work: Path, lens_covariance: Mapping[str, Array] | None = None
+    ) -> PosedRig:
+        """Poses by the board that several cameras see at once, where session.toml lists recordings of it, else by
+        structure from motion of the static scene; and where this shows the board. `work` is an empty folder."""
         static = self.static_images()
-        posed, sweep = solve_poses(static, self.sweep_images, lenses, self.detector, work)
+        if self.extrinsics:
+            sightings = shared_sightings(self.extrinsics, self.detector, self.session.reference)
+            posed = board_poses(sightings, lenses, lens_covariance)
+            return sight_prints(static, [], lenses, posed, self.session, self.detector)
+        posed, sweep = solve_poses(static, self.sweep_images, lenses, self.detector, work, lens_covariance)
         return sight_prints(static, sweep, lenses, posed, self.session, self.detector)
 
     def check_sizes(self, lenses: Mapping[str, Lens], others: Mapping[str, Recording]) -> None:
         """Raise SplashbenchError where a camera recorded at another size than its lens was calibrated at."""
-        checked: list[Mapping[str, Recording | Stills]] = [self.static, dict(others)]
+        checked: list[Mapping[str, Recording | Stills]] = [self.static, self.extrinsics, dict(others)]
         for recordings in checked:
             for camera, recording in recordings.items():
                 lens, info = lenses[camera], recording.info
@@ -111,9 +141,11 @@ def find_poses(
     lenses: Mapping[str, Lens],
     detector: Detector,
     work: Path,
+    lens_covariance: Mapping[str, Array] | None = None,
 ) -> poses.Poses:
     """Structure from motion of the static scene, in its own units; `work` is an empty folder."""
-    return poses.estimate_poses(static, lenses, sweep, work, focal_guess(sweep, detector))
+    guess = focal_guess(sweep, detector)
+    return poses.estimate_poses(static, lenses, sweep, work, guess, lens_covariance=lens_covariance)
 
 
 def solve_poses(
@@ -122,6 +154,7 @@ def solve_poses(
     lenses: Mapping[str, Lens],
     detector: Detector,
     work: Path,
+    lens_covariance: Mapping[str, Array] | None = None,
 ) -> tuple[poses.Poses, list[Image]]:
     """Structure from motion of the static scene, and the frames of the sweep that it used.
 
@@ -132,14 +165,15 @@ def solve_poses(
     sweep = sweep_images(poses.SWEEP_FRAMES)
     first, second = work / "first", work / "second"
     first.mkdir()
+    find = find_poses if lens_covariance is None else partial(find_poses, lens_covariance=lens_covariance)
     try:
-        return find_poses(static, sweep, lenses, detector, first), sweep
+        return find(static, sweep, lenses, detector, first), sweep
     except SplashbenchError as error:
         more = sweep_images(2 * poses.SWEEP_FRAMES)
         if len(more) <= len(sweep):
             raise
         second.mkdir()
-        solved = find_poses(static, more, lenses, detector, second)
+        solved = find(static, more, lenses, detector, second)
         failed = f"{len(sweep)} frames of the sweep: {error}"
         return replace(solved, attempts=(failed, *solved.attempts)), more
 
@@ -191,7 +225,7 @@ def find_frame(
     if session.distance is not None:
         first, second = session.distance.cameras
         distance = scale.distance_scale(rig.poses, (first, second), session.distance.metres)
-    return scale.choose_frame(board, marker, distance, container)
+    return scale.choose_frame(board, marker, distance, container, rig.poses.metres_per_unit)
 
 
 def _sightings(

@@ -4,10 +4,10 @@ Up and origin: the marker, where session.toml has one; else the board, which the
 that was placed in the reconstruction and stands upright. A marker comes before the board because it is described only
 where the board does not lie flat in the static scene.
 
-Metres: the board, else the marker, else the measured distance between two cameras, else the container. The order is by
-how exactly each is known: a print to a tenth of a millimetre, with many corners before one with four; a distance
-between the centres of two lenses to millimetres; a container by the outlines of its masks. All are recorded, since two
-that disagree show that one of them is wrong.
+Metres: the board that placed the cameras, where it did; else the board in the static scene, the marker, the measured
+distance between two cameras, the container. The order is by how exactly each is known: a print to a tenth of a
+millimetre, with many corners before one with four; a distance between the centres of two lenses to millimetres; a
+container by the outlines of its masks. All are recorded, since two that disagree show that one of them is wrong.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from splashbench.prepare.calibration.lens import Array
 from splashbench.prepare.poses.metric import MetricFrame
 from splashbench.prepare.poses.structure_from_motion import Poses
 
-Source = Literal["board", "marker", "distance", "container"]
+Source = Literal["extrinsics", "board", "marker", "distance", "container"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +102,10 @@ def choose_frame(
     marker: MetricFrame | None,
     distance: float | None,
     container: Upright | None = None,
+    own_scale: float | None = None,
 ) -> SceneFrame:
-    """The scene frame by the precedence above; `distance`: metres per unit by `distance_scale`.
+    """The scene frame by the precedence above; `distance`: metres per unit by `distance_scale`; `own_scale`: that of
+    poses that have one.
 
     Raises SplashbenchError, in one line with its remedy, where nothing gives up, or nothing gives metres.
     """
@@ -112,7 +114,8 @@ def choose_frame(
         prints["board"] = board
     if marker is not None:
         prints["marker"] = marker
-    scales: dict[Source, float] = {source: frame.scene_from_sfm.scale for source, frame in prints.items()}
+    scales: dict[Source, float] = {} if own_scale is None else {"extrinsics": own_scale}
+    scales |= {source: frame.scene_from_sfm.scale for source, frame in prints.items()}
     if distance is not None:
         scales["distance"] = distance
     if container is not None and container.metres_per_unit is not None:

@@ -1,24 +1,52 @@
-"""The stages poses and metric: structure from motion of the static scene, then its metres and its up."""
+"""The stages poses and metric: have the cameras stood still, structure from motion, then its metres and its up."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.calibration.lens import Lens
+from splashbench.prepare.audio.sync import ClockFit
+from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.poses import rig
 from splashbench.prepare.poses.rig import PosedRig, RigRecordings
 from splashbench.prepare.poses.scale import SceneFrame, Upright
+from splashbench.prepare.poses.stillness import Stillness, find_stillness
 from splashbench.prepare.stage_cache import FileFacts, StageStore, facts_of
+from splashbench.prepare.video.pour import PourRecordings
 
 
-def posed_rig(store: StageStore, recordings: RigRecordings, lenses: Mapping[str, Lens]) -> PosedRig:
+def stillness(
+    store: StageStore,
+    recordings: RigRecordings,
+    pour: PourRecordings,
+    clocks: Mapping[str, ClockFit],
+    interval: tuple[float, float],
+) -> dict[str, Stillness]:
+    """How far every camera's pictures of the pour are from its static picture; `interval`: seconds, reference clock."""
+    inputs = {
+        "static": {camera: facts_of(static.paths) for camera, static in recordings.static.items()},
+        "pour": pour.all_files,
+        "clocks": clocks,
+        "interval": interval,
+    }
+
+    def compare() -> dict[str, Stillness]:
+        return find_stillness(recordings.static_image, pour.recordings, clocks, interval)
+
+    return store.result("poses", dict[str, Stillness], inputs, compare, part="stillness")
+
+
+def posed_rig(store: StageStore, recordings: RigRecordings, calibrations: Mapping[str, Calibration]) -> PosedRig:
     """The cameras' poses in structure from motion's own units, and the prints that they see."""
     session = recordings.session
+    lenses = {camera: calibration.lens for camera, calibration in calibrations.items()}
+    covariance = {camera: calibration.lens_covariance for camera, calibration in calibrations.items()}
     inputs = {
         "static": {camera: facts_of(static.paths) for camera, static in recordings.static.items()},
         "sweep": facts_of(recordings.sweep.paths) if recordings.sweep else None,
+        "extrinsics": {camera: facts_of(extrinsics.paths) for camera, extrinsics in recordings.extrinsics.items()},
         "lenses": lenses,
+        "lens_covariance": covariance,
         "board": session.board,
         "marker": session.marker,
     }
@@ -26,7 +54,7 @@ def posed_rig(store: StageStore, recordings: RigRecordings, lenses: Mapping[str,
     def pose() -> PosedRig:
         try:
             with store.scratch() as scratch:
-                return recordings.pose(lenses, scratch)
+                return recordings.pose(lenses, scratch, covariance)
         except RuntimeError as error:  # COLMAP's, for one when its database finds the disk full
             raise SplashbenchError(
                 f"{session.directory}: COLMAP failed ({error}); check the space in {store.folder}"

@@ -39,8 +39,10 @@ class Poses:
     `colours`: [N, 3] in [0, 1]. `mean_error_px`: mean distance over all observations of all images between an observed
     feature and its point's projection, in pixels of the raw frames; `rms_error_px` the root mean square of the same.
     `centre_sigma`, `rotation_sigma_deg`: fixed camera -> root mean square error to expect of its centre and of its
-    rotation, relative to the other fixed cameras (see `covariance`); empty where they could not be had. `attempts`: how
-    each attempt at mapping ended. `found_lenses`: of cameras whose lens was not given.
+    rotation, relative to the other fixed cameras (see `covariance`); empty where they could not be had.
+    `feature_centre_sigma`, `feature_rotation_sigma_deg`: the part of them that the noise of the features explains, the
+    rest being the lenses' own. `attempts`: how each attempt at mapping ended. `found_lenses`: of cameras whose lens was
+    not given. `metres_per_unit`: where the poses have a scale of their own, as those of `board_rig` have.
     """
 
     w2c: dict[str, Array]
@@ -57,6 +59,9 @@ class Poses:
     rotation_sigma_deg: dict[str, float] = field(default_factory=dict)
     attempts: tuple[str, ...] = ()
     found_lenses: dict[str, Lens] = field(default_factory=dict)
+    feature_centre_sigma: dict[str, float] = field(default_factory=dict)
+    feature_rotation_sigma_deg: dict[str, float] = field(default_factory=dict)
+    metres_per_unit: float | None = None
 
     @property
     def mean_track_length(self) -> float:
@@ -88,6 +93,7 @@ def estimate_poses(
     work: Path,
     sweep_focal: float | None = None,
     threads: int = 1,
+    lens_covariance: Mapping[str, Array] | None = None,
 ) -> Poses:
     """Poses of the fixed cameras from one raw image each, bridged by frames of the sweep, of which there may be none.
 
@@ -95,7 +101,8 @@ def estimate_poses(
     coefficient estimated with its pose, so with no lenses and no sweep this is structure from motion of any set of
     photographs. `work` is an empty folder for COLMAP's images and database. `sweep_focal`: the sweep camera's focal
     length in pixels to start from; without it, 1.2 image widths. Its lens is refined, its principal point last
-    of all. `threads`: 1 gives the same result each time. Raises SplashbenchError naming the cameras that could not be
+    of all. `threads`: 1 gives the same result each time. `lens_covariance`: of the calibrated lenses, see
+    `Calibration`; it enters the deviations, not the poses. Raises SplashbenchError naming the cameras that could not be
     posed.
     """
     bar = Bar("structure from motion")
@@ -109,7 +116,11 @@ def estimate_poses(
             principal = refine(mapped.reconstruction, workplace)
             bar.update(0.9, "deviations")
             names = list(workplace.names.values())
-            sigmas = pose_sigmas(mapped.reconstruction, names, workplace.fixed_lenses, principal)
+            by_name = {image.name: image.camera_id for image in mapped.reconstruction.images.values()}
+            lenses_known = {
+                by_name[workplace.names[camera]]: covariance for camera, covariance in (lens_covariance or {}).items()
+            }
+            sigmas = pose_sigmas(mapped.reconstruction, names, workplace.fixed_lenses, principal, lenses_known)
             bar.update(1.0)
     finally:
         bar.close()
@@ -125,6 +136,9 @@ def _collect(
     sigmas: PoseSigmas | None,
     attempts: tuple[str, ...],
 ) -> Poses:
+    def by_camera(by_name: Mapping[str, float] | None) -> dict[str, float]:
+        return {} if by_name is None else {camera: by_name[name] for camera, name in names.items()}
+
     images = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     swept = sorted(name for name in images if name.startswith(f"{SWEEP_FOLDER}/"))
     errors = []
@@ -154,8 +168,10 @@ def _collect(
         mean_error_px=float(distances.mean()),
         rms_error_px=float(np.sqrt(np.mean(distances**2))),
         n_observations=len(distances),
-        centre_sigma={} if sigmas is None else {camera: sigmas.centre[name] for camera, name in names.items()},
-        rotation_sigma_deg={} if sigmas is None else {c: sigmas.rotation_deg[name] for c, name in names.items()},
+        centre_sigma=by_camera(None if sigmas is None else sigmas.centre),
+        rotation_sigma_deg=by_camera(None if sigmas is None else sigmas.rotation_deg),
+        feature_centre_sigma=by_camera(None if sigmas is None else sigmas.feature_centre),
+        feature_rotation_sigma_deg=by_camera(None if sigmas is None else sigmas.feature_rotation_deg),
         attempts=attempts,
         found_lenses={camera: _simple_lens(reconstruction.cameras[images[names[camera]].camera_id]) for camera in free},
     )

@@ -1,4 +1,4 @@
-"""Cameras and lenses in the report: where the rig stands, how sure its poses are, how well each lens fits."""
+"""Cameras and lenses in the report: where the rig stands, whether it stayed there, how sure poses and lenses are."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from splashbench.pages.blocks import Block, Bullets, Note, Table
 from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
+from splashbench.prepare.gates import stillness_limit
+from splashbench.prepare.poses.stillness import INSTANTS
 from splashbench.prepare.preparation import Preparation
 from splashbench.prepare.report.pictures import SWEEP_COLOUR, TEST_COLOUR, TRAIN_COLOUR, chart
 
@@ -26,7 +28,8 @@ def cameras_section(preparation: Preparation) -> list[Block]:
         axes.scatter(points[:, a], points[:, b], s=0.3, color="#cccccc")
         for name, print_ in prints.items():
             axes.scatter(print_.corners[:, a], print_.corners[:, b], s=3, color="black", label=name)
-        axes.plot(sweep[:, a], sweep[:, b], ".", color=SWEEP_COLOUR, markersize=4, label="sweep")
+        if len(sweep):
+            axes.plot(sweep[:, a], sweep[:, b], ".", color=SWEEP_COLOUR, markersize=4, label="sweep")
         for camera, centre in centres.items():
             colour = TEST_COLOUR if camera in preparation.session.test else TRAIN_COLOUR
             forward = preparation.poses.w2c[camera][2, :3] * 0.2 * reach
@@ -39,10 +42,13 @@ def cameras_section(preparation: Preparation) -> list[Block]:
             axes.legend(fontsize=8)
     poses = preparation.poses
     width = next(iter(preparation.calibrations.values())).lens.width
+    sweep_text = f"{len(poses.sweep_w2c)} of {poses.n_sweep} sweep frames registered." if poses.n_sweep else "No sweep."
+    if poses.metres_per_unit is not None:
+        sweep_text = "The cameras were placed by the board that several of them saw at once."
     text = (
         f"Mean reprojection error {poses.mean_error_px:.3f} px (RMS {poses.rms_error_px:.3f}) over"
         f" {poses.n_observations} observations of {len(poses.points)} points, in frames {width} px wide;"
-        f" {len(poses.sweep_w2c)} of {poses.n_sweep} sweep frames registered."
+        f" {sweep_text}"
         + "".join(
             f" {name.capitalize()}: {print_.rms_m * 1000:.2f} mm RMS over {print_.n_corners} corners."
             for name, print_ in prints.items()
@@ -54,13 +60,24 @@ def cameras_section(preparation: Preparation) -> list[Block]:
         [
             camera,
             *(f"{value:.4f}" for value in centres[camera]),
-            f"{poses.centre_sigma[camera] * 1e3:.3f}" if camera in poses.centre_sigma else "unknown",
-            f"{poses.rotation_sigma_deg[camera]:.4f}" if camera in poses.rotation_sigma_deg else "unknown",
+            *(
+                f"{sigma[camera] * factor:.{digits}f}" if camera in sigma else "unknown"
+                for sigma, factor, digits in (
+                    (poses.centre_sigma, 1e3, 2),
+                    (poses.feature_centre_sigma, 1e3, 2),
+                    (poses.rotation_sigma_deg, 1.0, 3),
+                    (poses.feature_rotation_sigma_deg, 1.0, 3),
+                )
+            ),
         ]
         for camera in centres
     ]
-    header = ["camera", "x [m]", "y [m]", "z [m]", "± centre [mm]", "± rotation [deg]"]
-    note = "±: standard deviation relative to the other fixed cameras, from the noise of the features alone."
+    header = ["camera", "x [m]", "y [m]", "z [m]", "± centre [mm]", "of that features [mm]", "± rotation [deg]"]
+    header.append("of that features [deg]")
+    note = (
+        "±: standard deviation relative to the other fixed cameras, by the noise of the features and by the deviations"
+        " of the lenses. Of that features: by the noise of the features alone, as if the lenses were exact."
+    )
     attempts = [f"Structure from motion tried more than once: {line}" for line in poses.attempts[:-1]]
     return [
         chart(figure, "the rig from above and from the front"),
@@ -69,6 +86,21 @@ def cameras_section(preparation: Preparation) -> list[Block]:
         Note(note),
         *([Bullets(attempts)] if attempts else []),
     ]
+
+
+def stillness_section(preparation: Preparation) -> list[Block]:
+    """A table of how far each camera's picture of the background moved from its static clip to the pour."""
+    limit = stillness_limit(next(iter(preparation.calibrations.values())).lens.width)
+    rows = []
+    for camera, seen in preparation.stillness.items():
+        shifts = ["unknown" if seen[instant].px is None else f"{seen[instant].px:.2f}" for instant in INSTANTS]
+        rows.append([camera, *shifts, str(min(shift.agreeing for shift in seen.values()))])
+    header = ["camera", *(f"at the {instant} [px]" for instant in INSTANTS), "features, at least"]
+    note = (
+        "RMS shift of the static background, from the static clip to the pour, at three instants of the motion."
+        f" Pixels of the raw frames. Above {limit:.2f} px the camera has moved, and no scene is made."
+    )
+    return [Table(header, rows), Note(note)]
 
 
 def lenses_section(preparation: Preparation) -> list[Block]:
@@ -87,11 +119,12 @@ def lenses_section(preparation: Preparation) -> list[Block]:
                 f"{K[0, 2]:.1f}",
                 f"{K[1, 2]:.1f}",
             ]
-            + [f"{value:.4f}" for value in distortion]
-            + [f"{calibration.rms_px:.3f}", f"{calibration.held_out_rms_px:.3f}", f"{calibration.coverage:.0%}"]
+            + ["none" if value == 0 else f"{value:.4f}" for value in distortion]
+            + [f"{calibration.rms_px:.3f}", f"{calibration.held_out_rms_px:.3f}", f"{100 * calibration.coverage:.0f}"]
             + [f"{calibration.n_views}/{calibration.n_detected}/{calibration.n_searched}"]
         )
-    header = ["camera", "fx", "fy", "± f", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "RMS", "held out", "coverage"]
+    header = ["camera", "fx [px]", "fy [px]", "± f [px]", "cx [px]", "cy [px]", "k1", "k2", "p1", "p2", "k3"]
+    header += ["RMS [px]", "held out [px]", "coverage [%]", "views"]
     count = len(preparation.calibrations)
     figure = Figure(figsize=(9, 1.6 * ((count + 3) // 4)), layout="constrained")
     for index, (camera, calibration) in enumerate(preparation.calibrations.items()):
@@ -107,10 +140,10 @@ def lenses_section(preparation: Preparation) -> list[Block]:
         axes.set_yticks(np.linspace(0, calibration.lens.height, COVERAGE_CELLS[1] + 1), labels=[])
         axes.grid(linewidth=0.3)
     note = (
-        "Pixels. Errors are RMS over corners. Views: used / with a board / searched. Below: all corners used, on the"
-        " cells that coverage counts."
+        "Distortion has no unit; none: held at zero, as the board did not determine it. Errors are RMS over corners."
+        " Views: used / with a board / searched. Below: all corners used, on the cells that coverage counts."
     )
-    return [Table([*header, "views"], rows), Note(note), chart(figure, "where the boards' corners were seen")]
+    return [Table(header, rows), Note(note), chart(figure, "where the boards' corners were seen")]
 
 
 def camera_centre(w2c: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,10 +16,12 @@ def clocks_section(preparation: Preparation) -> list[Block]:
         [
             camera,
             f"{fit.start_s:.6f}",
-            f"{(fit.clock_rate - 1) * 1e6:+.1f}",
+            f"{(fit.clock_rate - 1) * 1e6:+.1f} ± {fit.drift_interval * 1e6:.1f}",
+            f"{fit.interval_s * 1e3:.2f}",
             "reference" if camera == preparation.session.reference else f"{fit.confidence:.1f}",
             f"{fit.residual_rms_s * 1e6:.0f}",
-            str(fit.n_windows),
+            f"{fit.n_windows}, {fit.agreement:.0%}" if fit.n_windows else "",
+            f"{fit.echo_s * 1e3:+.1f}" if fit.echo_s else "none",
             f"{offsets[camera] * 1e3:+.2f}" if camera in offsets else "unknown",
         ]
         for camera, fit in preparation.clocks.items()
@@ -28,16 +30,22 @@ def clocks_section(preparation: Preparation) -> list[Block]:
         "camera",
         "start [s]",
         "drift [us/s]",
+        "known to [ms]",
         "confidence",
         "scatter [us]",
-        "windows",
+        "windows, agreeing",
+        "earlier sound [ms]",
         "residual in the sequence [ms]",
     ]
     note = (
-        "Reference time = start + (1 + drift) x local time. Residual in the sequence: the offset from that, measured"
-        f" again within the motion interval, less the mean over cameras{_both(preparation)}. Below: every window of"
-        " sound that a clock was fitted to, by its delay from the clock's line. The scatter shows how well single"
-        " windows agree; a bend would be a clock whose rate changed."
+        "Reference time = start + (1 + drift) x local time. The true drift lies within its interval with 95 %, and the"
+        " true clock within what it is known to, at the worst moment that both cameras record. A drift of +0.0 is one"
+        " that the sound was too short to tell from none. Confidence: how many times better the sound matches at this"
+        " offset than at any other. Earlier sound: a weaker copy precedes the sound that the clock follows, so it is"
+        " a reflection; positive in this camera, negative in the reference. Residual in the sequence: the offset from"
+        f" the clock, measured again within the motion interval, less the mean over cameras{_both(preparation)}. Below:"
+        " every window of sound that a clock was fitted to, by its delay from the clock's line. The scatter is that of"
+        " all windows with one clear peak. A bend would be a clock whose rate changed."
     )
     return [
         Table(header, rows),

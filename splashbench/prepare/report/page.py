@@ -1,7 +1,8 @@
 """prepare_report.html: the outcome of a preparation, on one page that needs nothing else.
 
 What needs a person's eye comes first: the gates, then masks on the frames, then cameras, lenses and clocks. The page
-tells of the scene alone, not of the run that made it, so that the same recordings always give the same bytes.
+tells of the scene alone, not of the run that made it, so that the same recordings always give the same bytes. Its date
+is therefore that of the recordings.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from splashbench.pages.blocks import Block, Bullets, Note, Sheet, Table
 from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.masks.sheet import fault_note, mask_sheet, sheet_times
 from splashbench.prepare.preparation import Preparation
-from splashbench.prepare.report.cameras import cameras_section, lenses_section
+from splashbench.prepare.report.cameras import cameras_section, lenses_section, stillness_section
 from splashbench.prepare.report.clocks import clocks_section, recordings_section
+from splashbench.prepare.report.gates import gates_section
 from splashbench.prepare.report.pictures import chart, photograph
+from splashbench.version import __version__
 
 
 def html_report(preparation: Preparation) -> str:
@@ -30,9 +33,10 @@ def html_report(preparation: Preparation) -> str:
         f" {session.reference}. {verdict}"
     )
     sections = [
-        ("Gates", _gates(preparation)),
+        ("Gates", gates_section(preparation)),
         (f"Masks ({preparation.masks.provider})", _masks(preparation)),
         ("Cameras", cameras_section(preparation)),
+        ("Cameras at rest", stillness_section(preparation)),
         ("Container", _container(preparation.container, preparation) if preparation.container else []),
         ("Lenses", lenses_section(preparation)),
         ("Clocks", clocks_section(preparation)),
@@ -40,22 +44,14 @@ def html_report(preparation: Preparation) -> str:
         ("Recordings", recordings_section(preparation)),
     ]
     folder = Path(__file__).parent
-    return render(folder, "preparation.html.j2", name=session.name, summary=summary, sections=sections)
+    origin = f"Recorded {recorded_on(preparation)}. Prepared by splashbench {__version__}."
+    return render(folder, "preparation.html.j2", name=session.name, summary=summary, origin=origin, sections=sections)
 
 
-def _gates(preparation: Preparation) -> list[Block]:
-    rows = [
-        [
-            gate.name.replace("_", " "),
-            "unknown" if gate.value is None else f"{gate.value:.4g}",
-            f"{gate.side} {gate.limit:.4g}",
-            "passed" if gate.passed else "failed",
-            gate.detail,
-        ]
-        for gate in preparation.gates
-    ]
-    classes = ["passed" if gate.passed else "failed" for gate in preparation.gates]
-    return [Table(["gate", "value", "limit", "outcome", "what it is"], rows, classes)]
+def recorded_on(preparation: Preparation) -> str:
+    """The day of the pour by the reference camera's clock, or that it is unknown."""
+    created = preparation.synced.videos[preparation.session.reference].created
+    return created[:10] if created else "on a day that its files do not tell"
 
 
 def _masks(preparation: Preparation) -> list[Block]:
@@ -92,7 +88,7 @@ def _masks(preparation: Preparation) -> list[Block]:
             for camera in preparation.session.cameras
         )
     ]
-    header = ["camera", "empty frames", "failed frames", "image written", "its top left in the frame"]
+    header = ["camera", "empty frames", "failed frames", "image written [px]", "its top left in the frame [px]"]
     return [chart(figure, "area of the masks over time, a line per camera"), Table(header, rows), picture]
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio.waveform import AudioTrack, join_audio
+from splashbench.prepare.video.chapters import check_chapters
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +43,7 @@ class VideoInfo:
         n_frames: as the container promises; counted, for a `Recording`.
         duration, start_time: of the video stream, seconds.
         audio_minus_video_s: how much longer the audio stream is than the video stream; None without audio.
+        timecode, created: of the first frame (hours, minutes, seconds, frames) and of the file (ISO 8601), where given.
     """
 
     width: int
@@ -54,6 +56,7 @@ class VideoInfo:
     codec: str
     timecode: str | None
     audio_minus_video_s: float | None
+    created: str | None = None
 
 
 @contextmanager
@@ -105,6 +108,7 @@ def probe(path: Path) -> VideoInfo:
             codec=stream.codec_context.name,
             timecode=timecode,
             audio_minus_video_s=longer,
+            created=container.metadata.get("creation_time") or stream.metadata.get("creation_time"),
         )
 
 
@@ -203,9 +207,19 @@ class Recording:
         return np.concatenate([[0.0], np.cumsum([chapter.duration for chapter in self._chapters])])
 
     @cached_property
+    def _chapter_infos(self) -> tuple[VideoInfo, ...]:
+        infos = tuple(probe(path) for path in self.paths)
+        check_chapters(self.paths, infos)
+        return infos
+
+    def check(self) -> None:
+        """Raise SplashbenchError where a file cannot be read, or does not follow the one before it; headers tell."""
+        _ = self._chapter_infos
+
+    @cached_property
     def info(self) -> VideoInfo:
         """Facts of the whole recording; frames are counted. Raises SplashbenchError when chapters do not match."""
-        chapters = [probe(path) for path in self.paths]
+        chapters = self._chapter_infos
         for path, chapter in zip(self.paths, chapters):
             if (chapter.width, chapter.height, chapter.codec) != (
                 chapters[0].width,

@@ -13,7 +13,9 @@ from typing import Any
 
 import pandas as pd
 
+from splashbench.errors import one_line
 from splashbench.report.anytime import (
+    MAX_DRAWN,
     QUALITY,
     before,
     by_scene,
@@ -24,9 +26,11 @@ from splashbench.report.anytime import (
 )
 from splashbench.report.decision_text import BASES, chosen_rung, rung_table, shortened
 from splashbench.report.groups import Entry, Group, comparable, told_text
+from splashbench.report.results import claimed_text, shown_differences
 from splashbench.score.metrics import METRICS
-from splashbench.score.notation import FILTER_MARK, in_shown_unit, label, shown
+from splashbench.score.notation import FILTER_MARK, NO_FIGURE, in_shown_unit, label, shown
 from splashbench.score.result import Result
+from splashbench.score.verification import Verification
 from splashbench.statistics import Estimate, estimate
 from splashbench.submission import Decision
 
@@ -37,7 +41,7 @@ QUALITIES = (*QUALITY, "dpsnr_bg", "ssim", "spill", "jitter_error", "uniformity"
 _SHOWN = tuple(dict.fromkeys((*TABLE, *COSTS, *QUALITIES)))
 _DIGITS = 6
 #: Of a run in the page, and rungs of a decision; `splashbench explain` shows all.
-MAX_DECISIONS, MAX_RUNGS = 20, 15
+MAX_DECISIONS, MAX_RUNGS, MAX_NOTES, MAX_STAGES = 20, 15, 60, 60
 
 
 def metric_facts() -> dict[str, dict[str, Any]]:
@@ -57,6 +61,7 @@ def metric_facts() -> dict[str, dict[str, Any]]:
 def group_facts(group: Group) -> dict[str, Any]:
     """A group's curves, standings and estimates, over the scenes that its entries have in common; and its chases."""
     shared = comparable(group)
+    nothing = {name: before(shared, name) for name in QUALITY}
     kept = {entry.label for entry in shared.entries}
     return {
         "shared_scenes": list(shared.scenes.values()) if kept else [],
@@ -68,7 +73,7 @@ def group_facts(group: Group) -> dict[str, Any]:
         "entries": [entry.label for entry in group.entries],
         "curves": {name: [_curve(curve) for curve in curves(shared, name)] for name in QUALITY},
         "standings": {name: [_standing(name, standing) for standing in standings(shared, name)] for name in QUALITY},
-        "estimates": {entry.label: _estimates(shared, entry) for entry in shared.entries},
+        "estimates": {entry.label: _estimates(nothing, entry) for entry in shared.entries},
         "hypervolumes": {name: _estimate(found) for name, found in hypervolumes(shared).items()},
         "chases": {
             name: [
@@ -97,7 +102,7 @@ def _standing(name: str, standing: Any) -> dict[str, Any]:
     lead = standing.lead
     return {
         "seconds": standing.seconds,
-        "ranking": [{"label": label, **_estimate(found)} for label, found in standing.ranking],
+        "ranking": [{"label": label, **_estimate(found)} for label, found in standing.ranking[:MAX_DRAWN]],
         "lead": None
         if lead is None
         else {
@@ -114,19 +119,19 @@ def _estimate(found: Estimate) -> dict[str, Any]:
     return {"value": rounded(found.value), "interval": interval}
 
 
-def _estimates(group: Group, entry: Entry) -> dict[str, Any]:
+def _estimates(nothing: Mapping[str, Mapping[str, float]], entry: Entry) -> dict[str, Any]:
     """Inter-quartile mean of each metric over the entry's runs, and how many there are and failed.
 
-    A failed run has the quality that `nothing` has of its scene, where that is known, and no cost.
+    A failed run has the quality that `nothing` (by metric and scene) has of its scene, where known, and no cost.
     """
     figures: dict[str, Any] = {}
     fine = [result for result in entry.results if result.status == "ok"]
     for name in _SHOWN:
         values = {(r.digests.scene, r.seed): v for r in fine if (v := r.value(name)) is not None}
         if name in QUALITY:
-            nothing = before(group, name)
-            charged = [r for r in entry.results if r.status != "ok" and r.digests.scene in nothing]
-            values |= {(r.digests.scene, r.seed): nothing[r.digests.scene] for r in charged}
+            there = nothing[name]
+            charged = [r for r in entry.results if r.status != "ok" and r.digests.scene in there]
+            values |= {(r.digests.scene, r.seed): there[r.digests.scene] for r in charged}
         if values:
             scale = in_shown_unit(METRICS[name], 1.0)
             found = estimate([scale * part for part in by_scene(values)])
@@ -160,23 +165,33 @@ def run_facts(result: Result, group: int, label: str, scene: str, path: str) -> 
         "scene": scene,
         "seed": result.seed,
         "status": result.status,
-        "reason": result.reason,
+        "reason": one_line(result.reason),
         "control": result.control,
         "figures": figures,
         "course": course,
-        "stages": {name: rounded(seconds) for name, seconds in result.stages.items()},
-        "notes": result.notes,
+        "stages": {shortened(name, 60): rounded(seconds) for name, seconds in list(result.stages.items())[:MAX_STAGES]},
+        "notes": {one_line(name): one_line(text) for name, text in list(result.notes.items())[:MAX_NOTES]},
         "decisions": [_decision(decision) for decision in result.decisions[:MAX_DECISIONS]],
         "decisions_left_out": max(0, len(result.decisions) - MAX_DECISIONS),
         "file": path,
         "command": command(result),
         "submission": result.digests.submission[:12],
         "missing": sorted(
-            {m.reason for n, m in result.metrics.items() if m.value is None and m.reason and n in _SHOWN}
+            {one_line(m.reason) for n, m in result.metrics.items() if m.value is None and m.reason and n in _SHOWN}
             if result.status == "ok"
             else ()
         ),
     }
+
+
+def verification_facts(verification: Verification | None) -> dict[str, str]:
+    """What scoring the submission of a run again gave, in words; nothing where nobody asked."""
+    if verification is None:
+        return {}
+    words = [verification.verdict, *([shown_differences(verification.differences)] if verification.differences else [])]
+    words += [one_line(verification.reason)] if verification.reason else []
+    words += [f"not recomputed: {', '.join(verification.unchecked)}"] if verification.unchecked else []
+    return {"verification": ": ".join(words)}
 
 
 def _decision(decision: Decision) -> dict[str, Any]:
@@ -195,7 +210,14 @@ def _decision(decision: Decision) -> dict[str, Any]:
 
 
 def command(result: Result) -> str:
-    """The command that makes the run again, as far as a result tells it: not where files of the method lay."""
+    """The command that makes the run again, as far as a result tells it: not where files of the method lay.
+
+    It is one line without control characters, since people copy it into a terminal.
+    """
+    return one_line(_command(result))
+
+
+def _command(result: Result) -> str:
     scene, settings = f"scenes/{result.scene}", result.settings
     if result.method == "oracle":
         return shlex.join(["splashbench", "run", "oracle", scene, "OUT"])
@@ -220,13 +242,16 @@ def command(result: Result) -> str:
 def row_facts(row: pd.Series, group: int, label: str, runs: list[int]) -> dict[str, Any]:
     """A row of the table: medians over seeds in shown units, text as people read it, and numbers to sort by."""
     first: Result = row["results"][0]
-    cells = {}
+    cells: dict[str, list[float | str | None]] = {}
     for name in TABLE:
         value = row[name]
+        claimed = claimed_text(name, row["verifications"])
         if value is None or math.isnan(value):
+            if claimed:
+                cells[name] = [None, NO_FIGURE + claimed]
             continue
         mark = FILTER_MARK if first.mixed and METRICS[name].filtered else ""
-        cells[name] = [rounded(in_shown_unit(METRICS[name], value)), shown(METRICS[name], value) + mark]
+        cells[name] = [rounded(in_shown_unit(METRICS[name], value)), shown(METRICS[name], value) + mark + claimed]
     return {
         "scene": first.scene,
         "digest": first.digests.scene[:8],
@@ -239,6 +264,7 @@ def row_facts(row: pd.Series, group: int, label: str, runs: list[int]) -> dict[s
         "protocol": first.protocol_label,
         "told": told_text(first.told),
         "status": first.status,
+        **({"verified": row["verified"]} if row["verified"] else {}),
         "control": first.control,
         "seeds": row["seed"],
         "cells": cells,

@@ -7,6 +7,9 @@ const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot"];
 const SHAPES = ["circle", "square", "triangle-up", "diamond", "triangle-down", "cross"];
 const FIRST_ROWS = 400;
+// Marks in the chart of costs: more are a cloud without names, and take a browser minutes.
+const MOST_MARKS = 100;
+const few = names => names.slice(0, 20).join(", ") + (names.length > 20 ? ` and ${names.length - 20} more` : "");
 const ALL = "all scenes";
 
 function element(tag, text, attributes) {
@@ -54,7 +57,7 @@ const group = () => data.groups[+byId("group").value];
 function overScenes(chosen) {
   const shared = chosen.shared_scenes, all = chosen.scenes.length;
   const scenes = shared.length === all ? `${all} scene${all === 1 ? "" : "s"}` : `${shared.length} of ${all} scenes, on which all of these methods ran (${shared.join(", ")})`;
-  return scenes + (chosen.left_out.length ? `, without ${chosen.left_out.join(", ")}` : "");
+  return scenes + (chosen.left_out.length ? `, without ${few(chosen.left_out)}` : "");
 }
 function drawCards() {
   const chosen = group();
@@ -114,7 +117,7 @@ function drawAnytime() {
   const without = chosen.entries.filter(label => !chosen.left_out.includes(label) && !traces.some(t => t.legendgroup === label));
   const late = chosen.entries.filter(label => !data.runs.some(run => run.group === +byId("group").value && run.label === label && run.course.length));
   byId("anytime-note").textContent = traces.length
-    ? "A line begins where every run has a value, and ends with the longest fit. " + (scene === ALL ? `Bands: 95% intervals. Over ${overScenes(chosen)}. ` : "A line per seed; marks are checkpoints, the last one the end. ") + (without.length ? `Not drawn for want of figures: ${without.join(", ")}. ` : "") + (late.length ? `Without checkpoints, so that only the end is known: ${late.join(", ")}.` : "")
+    ? "A line begins where every run has a value, and ends with the longest fit. " + (scene === ALL ? `Bands: 95% intervals. Over ${overScenes(chosen)}. ` : "A line per seed; marks are checkpoints, the last one the end. ") + (without.length ? `Not drawn, for want of figures or of room: ${few(without)}. ` : "") + (late.length ? `Without checkpoints, so that only the end is known: ${few(late)}.` : "")
     : "No run has this figure and a fit time.";
 }
 
@@ -151,7 +154,8 @@ function drawCost() {
   const x = byId("cost-x").value, y = byId("cost-y").value, scene = byId("cost-scene").value;
   const found = points(x, y, scene), best = front(found, x, y), traces = [];
   if (best.length) traces.push({ x: best.map(p => p.x.value), y: best.map(p => p.y.value), mode: "lines", line: { color: "#999999", width: 1.3, shape: data.metrics[x].better === "higher" ? "vh" : "hv" }, hoverinfo: "skip", name: "Pareto front" });
-  for (const p of found) {
+  const onFront = new Set(best), marks = [...best, ...found.filter(p => !onFront.has(p))].slice(0, MOST_MARKS), drawn = new Set(marks);
+  for (const p of found.filter(p => drawn.has(p))) {
     const { colour, shape } = look(p.label);
     traces.push({ x: [p.x.value], y: [p.y.value], error_x: bars([p], "x", colour), error_y: bars([p], "y", colour), name: plain(p.label), mode: "markers",
       marker: { color: colour, symbol: p.failed ? `${shape}-open` : shape, size: 12 }, customdata: [p.run], hovertemplate: `${plain(p.label)}<br>%{x:.4g}, %{y:.4g}<extra>${plain(p.note)}</extra>` });
@@ -162,7 +166,7 @@ function drawCost() {
     yaxis: { title: { text: data.metrics[y].label } } }), CONFIG).then(openPoint);
   const filtered = data.metrics[y].filtered ? found.filter(p => Object.hasOwn(group().estimates, p.label) && group().estimates[p.label].mixed).map(p => p.label) : [];
   byId("cost-note").textContent = found.length
-    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + (found.some(p => p.failed) ? "Hollow marks: some runs failed; these count with the quality of `nothing`. " : "") + "A click opens a run." + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
+    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + (found.some(p => p.failed) ? "Hollow marks: some runs failed; these count with the quality of `nothing`. " : "") + "A click opens a run." + (found.length > marks.length ? ` ${found.length - marks.length} more methods are in the table alone.` : "") + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
     : "No run has both figures.";
 }
 
@@ -184,7 +188,8 @@ function openPoint(chart) {
 }
 
 function drawChases() {
-  const found = group().chases[byId("chase-metric").value] || [], names = group().entries;
+  const found = group().chases[byId("chase-metric").value] || [], chased = new Set(found.map(c => c.label));
+  const names = group().entries.filter(label => group().entries.length <= data.drawn || chased.has(label));
   const table = byId("chases"), head = element("tr");
   head.append(element("th", "row after column"), ...names.map(name => element("th", name)));
   table.replaceChildren(head, ...names.map(label => {
@@ -224,7 +229,7 @@ function drawSummary() {
 
 // --- the table
 const COLUMNS = [["scene", "scene"], ["label", "method"], ["preset", "preset"], ["seeds", "seeds"], ["status", "status"],
-  ...data.columns.map(name => [name, data.metrics[name].label]), ["told", "told"]];
+  ...(data.rows.some(row => row.verified) ? [["verified", "verified"]] : []), ...data.columns.map(name => [name, data.metrics[name].label]), ["told", "told"]];
 let sorted = { column: null, ascending: true }, everything = false;
 
 function filtered() {
@@ -239,7 +244,7 @@ function drawRows() {
     const numeric = data.columns.includes(sorted.column), sign = sorted.ascending ? 1 : -1;
     const key = row => numeric ? (row.cells[sorted.column] || [null])[0] : row[sorted.column];
     rows.sort((a, b) => {
-      const [p, q] = [key(a), key(b)];
+      const [p, q] = [key(a) ?? null, key(b) ?? null];
       if (p === null || q === null) return (p === null) - (q === null); // what has no figure comes last, either way
       return sign * (numeric ? p - q : p.localeCompare(q, "en", { numeric: true }));
     });
@@ -279,6 +284,7 @@ function show(numbers, row) {
     stages(box, one);
     for (const [name, text] of Object.entries(one.notes)) box.append(element("p", `${name}: ${text}`, { class: "note" }));
     decisions(box, one);
+    if (one.verification) box.append(element("p", `scored again: ${one.verification}`, { class: "note" }));
     for (const reason of one.missing) box.append(element("p", `no figure: ${reason}`, { class: "note" }));
     if (one.sheet) box.append(element("img", null, { src: one.sheet, alt: `truth, render and opacity of ${one.label}, seed ${one.seed}`, loading: "lazy" }));
     box.append(element("p", `result ${one.file}, submission ${one.submission}`, { class: "note" }));

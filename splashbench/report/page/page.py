@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from splashbench.pages import render
-from splashbench.report.anytime import BUDGETS, QUALITY
+from splashbench.report.anytime import BUDGETS, MAX_DRAWN, QUALITY
 from splashbench.report.groups import groups
 from splashbench.report.page.content import (
     COSTS,
@@ -20,8 +20,9 @@ from splashbench.report.page.content import (
     metric_facts,
     row_facts,
     run_facts,
+    verification_facts,
 )
-from splashbench.report.results import ResultFile
+from splashbench.report.results import LeftOut, ResultFile
 from splashbench.report.speed_accuracy import reported_machine
 
 PAGE = "index.html"
@@ -33,6 +34,7 @@ def leaderboard_page(
     sources: Sequence[ResultFile],
     with_paper: bool = False,
     sheets: Mapping[str, str] | None = None,
+    left_out: Sequence[LeftOut] = (),
 ) -> str:
     """The page as text; the same results give the same bytes.
 
@@ -40,6 +42,7 @@ def leaderboard_page(
         table: from `leaderboard_table(sources)`.
         with_paper: the paper's figures, hollow and in a group of their own.
         sheets: contact sheets by the path of a result's file: an address, such as one that holds the picture.
+        left_out: files that could not be used, which are named.
     """
     from plotly.offline import get_plotlyjs
 
@@ -55,7 +58,8 @@ def leaderboard_page(
     runs = []
     for source in sources:
         n, label = place[id(source.result)]
-        runs.append(run_facts(source.result, n, label, scenes[n][source.result.digests.scene], source.path))
+        facts = run_facts(source.result, n, label, scenes[n][source.result.digests.scene], source.path)
+        runs.append(facts | verification_facts(source.verification))
     for run in runs:
         run["sheet"] = (sheets or {}).get(run["file"])
     number = {id(source.result): n for n, source in enumerate(sources)}
@@ -69,6 +73,7 @@ def leaderboard_page(
         "costs": list(COSTS),
         "qualities": list(QUALITIES),
         "budgets": list(BUDGETS),
+        "drawn": MAX_DRAWN,
         "quality": list(QUALITY),
         "groups": [group_facts(group) for group in found],
         "runs": runs,
@@ -76,7 +81,8 @@ def leaderboard_page(
         "settings": distinct_settings(source.result for source in sources),
         "paper": _paper() if with_paper else None,
     }
-    return render(_HERE, "leaderboard.html.j2", data=data, plotly=get_plotlyjs(), counts=_counts(table, sources))
+    content = {"data": data, "plotly": get_plotlyjs(), "counts": _counts(table, sources), "left_out": left_out}
+    return render(_HERE, "leaderboard.html.j2", **content)
 
 
 def _counts(table: pd.DataFrame, sources: Sequence[ResultFile]) -> dict[str, int]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz
@@ -41,6 +42,29 @@ _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
 
+# A feature of the last layer sees so many pixels, and all grids are the same again after so many.
+_SEEN, _PERIOD = 163, 16
+
+
+def _surroundings(differs: NDArray[np.bool_]) -> slice:
+    """The rows (or columns) that tell the distance, of those in which the images differ, bool [n].
+
+    A feature that sees a difference lies less than what it sees away from it, and sees as far again. A part that starts
+    at a multiple of the grids' period has the whole image's features, but for those at its edges, which see none.
+    """
+    where = np.flatnonzero(differs)
+    start = max(0, int(where[0]) - _SEEN) // _PERIOD * _PERIOD
+    return slice(start, min(len(differs), max(int(where[-1]) + 1 + _SEEN, start + _SEEN)))
+
+
+def _feature_count(pixels: int, layer: int) -> int:
+    """Features along a side of so many pixels after the convolution `layer`, counted from 0."""
+    count = (pixels + 2 * 2 - 11) // 4 + 1
+    for _, _, pooled in _CONVOLUTIONS[1 : layer + 1]:
+        count = (count - 3) // 2 + 1 if pooled else count
+    return count
+
+
 class Lpips:
     """The metric with its weights loaded. `digest` names them."""
 
@@ -60,17 +84,27 @@ class Lpips:
         self._scale = torch.tensor(_SCALE).reshape(1, 3, 1, 1)
 
     def __call__(self, first: Image, second: Image) -> float:
-        """Distance of two images [H, W, 3] in [0, 1], 31 px a side or more; exactly 0 for equal ones."""
+        """Distance of two images [H, W, 3] in [0, 1], 31 px a side or more; exactly 0 for equal ones.
+
+        What is equal in both has equal features, which add nothing to the sum: only the surroundings of what differs
+        are looked at. The means are over the whole images all the same.
+        """
         import torch
 
-        if np.array_equal(first, second):
+        differs = (first != second).any(axis=2)
+        if not differs.any():
             return 0.0
+        rows, columns = (_surroundings(differs.any(axis=axis)) for axis in (1, 0))
         with torch.inference_mode():
-            images = torch.from_numpy(np.stack([first, second]).astype(np.float32)).permute(0, 3, 1, 2)
+            images = np.stack([first[rows, columns], second[rows, columns]]).astype(np.float32)
+            cut = torch.from_numpy(images).permute(0, 3, 1, 2)
             total = 0.0
-            for features, head in zip(self._features(2 * images - 1), self._heads):
+            for i, (features, head) in enumerate(zip(self._features(2 * cut - 1), self._heads)):
                 unit = features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
-                total += float(((unit[:1] - unit[1:]).square() * head).sum(1).mean())
+                distance = ((unit[:1] - unit[1:]).square() * head).sum(1)
+                total += float(distance.sum(dtype=torch.float64)) / (
+                    _feature_count(differs.shape[0], i) * _feature_count(differs.shape[1], i)
+                )
         return total
 
     def _features(self, images: torch.Tensor) -> list[torch.Tensor]:

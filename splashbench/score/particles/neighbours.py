@@ -1,17 +1,21 @@
 """Sums over the nearest neighbours of every particle, by a list of cells: exact, and faster than a k-d tree.
 
 Points are sorted into cubic cells small enough that the cells around a point hold little more than the neighbours it
-needs. Where they hold fewer, the block of cells grows, at last to all points. Clumps, sheets and stray points cost
-time, not accuracy.
+needs. Where they hold fewer, the block of cells grows. Points for which it does not grow far enough, or holds far more
+than it should, get cells of another size, that of the median among them. So clumps, sheets and strays cost a little
+time and no accuracy.
 """
 
 from __future__ import annotations
+
+import itertools
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.parallel import over_range
+from splashbench.score.particles.copies import limited_copies
 
 #: Points in a cell, on the median, for each neighbour: enough then lie within a cell's edge of most points, in a volume
 #: as in a sheet. With fewer, blocks have to grow; with more, they hold too much.
@@ -22,9 +26,18 @@ _SHRINKINGS = 12
 _MAX_CELLS = 1 << 20
 #: Of a cell's edge: more than rounding can be off by in telling which of so many cells a point is in.
 _MARGIN = 1e-9
-#: The block's half width at most, in cells, before all points are looked at.
+#: The block's half width at most, in cells, before cells of another size are made, at last one for all points.
 _WIDEST = 3
 _MIN_POINTS_PER_THREAD = 512
+#: Blocks of 27 cells with more points for each neighbour are crowded: five times what they hold on the median.
+_CROWDED = 64
+#: How many sizes of cells are tried before all points are looked at for each that is left; and for how few of them
+#: that is done at once, since other cells would take longer.
+_MAX_LEVELS, _FEW = 16, 1000
+#: In place of a sum, none of which is below 0.
+_TOO_LARGE, _TOO_SMALL = -1.0, -2.0
+#: Of the radius: points this near to each other are at one place, whose sum is off by less than 1e-11 of itself.
+_ONE_PLACE = 1e-6
 
 
 def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: float) -> NDArray[np.float64]:
@@ -35,17 +48,53 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
     """
     if len(points) == 0:
         return np.zeros(0)
+    copies = limited_copies(points, neighbours + 1)
+    if copies is not None:
+        kept, place = copies
+        return nearest_poly6_sums(points[kept], neighbours, radius)[place]
+    sums = np.empty(len(points))
+    groups = [(np.arange(len(points)), False)]
+    for level in itertools.count(1):
+        if not groups:
+            return sums
+        pending, is_last = groups.pop()
+        left = _level(points, pending, neighbours, radius, sums, is_last or level >= _MAX_LEVELS)
+        groups += [(group, len(group) < _FEW or len(group) == len(pending)) for group in left if len(group)]
+    raise AssertionError
+
+
+def _level(
+    points: NDArray[np.float64],
+    pending: NDArray[np.intp],
+    neighbours: int,
+    radius: float,
+    sums: NDArray[np.float64],
+    is_last: bool,
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Fill in sums[pending] with cells of the size that suits the median of these points.
+
+    Returns those for which such cells are too large, and those for which they are too small. On the last level there
+    are none.
+    """
     # Of the median: strays far off must not move all others to the edge of the cells there are.
-    offsets = points - np.median(points, axis=0)
-    size = _cell_size(offsets, _PER_NEIGHBOUR * neighbours, radius)
+    offsets = points - np.median(points[pending], axis=0)
+    size = _cell_size(offsets, _PER_NEIGHBOUR * neighbours, radius, pending)
     cells = _cells(offsets, size)
     shape = cells.max(axis=0) + 1
     keys = _keys(cells, shape)
     order = np.argsort(keys, kind="stable")
-    sums = np.empty(len(points))
+    place = np.empty(len(points), dtype=np.intp)
+    place[order] = np.arange(len(points))
+    numbers = np.sort(place[pending])
+    # In the outermost cells there are points that are anywhere.
+    is_small = np.zeros(len(points), dtype=bool)
+    if size < _ONE_PLACE * radius:
+        is_small |= (np.abs(offsets[order]) < (_MAX_CELLS // 2 - 2) * size).all(axis=1)
+    found = np.empty(len(points))
     over_range(
         _sum_nearest,
-        len(points),
+        len(numbers),
+        numbers,
         np.ascontiguousarray(points[order]),
         cells[order],
         keys[order],
@@ -53,12 +102,13 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
         size,
         neighbours,
         radius,
-        sums,
+        is_small,
+        is_last,
+        found,
         smallest=_MIN_POINTS_PER_THREAD,
     )
-    result = np.empty_like(sums)
-    result[order] = sums
-    return result
+    sums[pending] = found[place[pending]]
+    return pending[sums[pending] == _TOO_LARGE], pending[sums[pending] == _TOO_SMALL]
 
 
 def _cells(offsets: NDArray[np.float64], size: float) -> NDArray[np.int64]:
@@ -73,13 +123,15 @@ def _keys(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int6
     return (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
 
 
-def _cell_size(offsets: NDArray[np.float64], target: float, radius: float) -> float:
-    """Edge of cells that hold about `target` points where the median point is; hardly above `radius` at most."""
+def _cell_size(
+    offsets: NDArray[np.float64], target: float, radius: float, among: NDArray[np.intp] | slice = slice(None)
+) -> float:
+    """Edge of cells that hold about `target` points where the median one `among` them is; hardly above `radius`."""
     size = (1 + 2 * _MARGIN) * radius
     for _ in range(_SHRINKINGS):
         cells = _cells(offsets, size)
         _, inverse, counts = np.unique(_keys(cells, cells.max(axis=0) + 1), return_inverse=True, return_counts=True)
-        median_count = float(np.median(counts[inverse]))
+        median_count = float(np.median(counts[inverse][among]))
         if median_count <= 1.3 * target:
             break
         # Between a sheet's square and a volume's cube.
@@ -144,6 +196,7 @@ def _smallest_first(values: np.ndarray, count: int, n_smallest: int) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sum_nearest(
+    numbers: np.ndarray,
     points: np.ndarray,
     cells: np.ndarray,
     keys: np.ndarray,
@@ -151,19 +204,29 @@ def _sum_nearest(
     size: float,
     neighbours: int,
     radius: float,
+    is_small: np.ndarray,
+    is_last: bool,
     sums: np.ndarray,
     start: int,
     stop: int,
 ) -> None:
-    """sums[start:stop] of `points` that are sorted by the `keys` of their `cells`."""
+    """sums of the points numbers[start:stop]; `points` are sorted by the `keys` of their `cells`.
+
+    Unless `is_last`, a point with a crowded block has _TOO_LARGE, and one with too few neighbours in the widest block
+    _TOO_SMALL. Where a point `is_small`, all of its block is at its place.
+    """
     squares = np.empty(len(points) + 1)
     rows = (2 * _WIDEST + 1) ** 2
     firsts, lasts = np.empty(rows, np.int64), np.empty(rows, np.int64)
     of_cell, of_half, n_rows = -1, 0, 0  # whose rows of cells these are
-    for number in range(start, stop):
+    for number in numbers[start:stop]:
         count = 0
+        total = 0.0
         half = 1
         while True:
+            if half > _WIDEST and not is_last:
+                count, total = 0, _TOO_SMALL
+                break
             if half > _WIDEST:
                 count = _collect(points, number, 0, len(points), radius * radius, squares, 0)
                 break
@@ -176,6 +239,16 @@ def _sum_nearest(
                         firsts[n_rows] = _first(keys, row + z_low)
                         lasts[n_rows] = _first(keys, row + z_high + 1)
                         n_rows += 1
+            if half == 1:
+                looked_at = 0
+                for n in range(n_rows):
+                    looked_at += lasts[n] - firsts[n]
+                if is_small[number] and looked_at > neighbours:
+                    count, total = 0, neighbours * radius**6
+                    break
+                if looked_at > _CROWDED * neighbours and not is_last:
+                    count, total = 0, _TOO_LARGE
+                    break
             # Whatever is nearer than this is in the block.
             reach = min((1 - _MARGIN) * half * size, radius)
             count = looked_at = 0
@@ -189,7 +262,6 @@ def _sum_nearest(
         if count > neighbours:
             _smallest_first(squares, count, neighbours)
             count = neighbours
-        total = 0.0
         for k in range(count):
             inner = radius * radius - squares[k]
             total += inner * inner * inner

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.parallel import over_range
+from splashbench.score.particles.copies import limited_copies
 
 #: In spacings: R, r, and the largest distance of liquid to the nearest particle.
 SUPPORT = 2.0
@@ -33,8 +34,11 @@ def spacing(points: NDArray[np.float64]) -> float | None:
 
     if len(points) <= NEIGHBOUR:
         return None
-    distances, _ = cKDTree(points).query(points, NEIGHBOUR + 1, workers=-1)
-    return float(np.median(distances[:, NEIGHBOUR]))
+    copies = limited_copies(points, NEIGHBOUR + 1)
+    single = points if copies is None else points[copies[0]]
+    distances, _ = cKDTree(single).query(single, NEIGHBOUR + 1, workers=-1)
+    third = distances[:, NEIGHBOUR]
+    return float(np.median(third if copies is None else third[copies[1]]))
 
 
 def particle_distance(

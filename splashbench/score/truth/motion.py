@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.scene import Particles
+from splashbench.score.particles.copies import limited_copies
 
 Vectors = NDArray[np.float64]
 
@@ -119,6 +120,9 @@ def frame_motion(
     true_positions, true_moved, airborne = true_positions[near], true_moved[near], airborne[near]
     if len(positions) == 0 or not near.any():
         return FrameMotion(none, none, none.astype(bool), len(true_positions))
+    copies = limited_copies(positions, NEIGHBOURS)
+    if copies is not None:
+        positions, moved = positions[copies[0]], moved[copies[0]]
     distances, neighbours = cKDTree(positions).query(
         true_positions, NEIGHBOURS, distance_upper_bound=REACH_VOXELS, workers=-1
     )

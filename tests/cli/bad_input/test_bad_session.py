@@ -54,6 +54,7 @@ POUR_2 = '2 = [\n    "2.MP4",\n]'
         (lambda s: (s / "session.toml").write_bytes(b'name = "\xff"'), "session.toml cannot be read as TOML"),
         (lambda s: (s / "session.toml").write_text("a = " + "[" * 100_000), "session.toml cannot be read as TOML"),
         (lambda s: ((s / "session.toml").unlink(), (s / "session.toml").mkdir()), "session.toml is a folder"),
+        (lambda s: (s / "session.toml").unlink(), "--init` writes it by looking at the recordings"),
     ],
 )
 def test_an_unusable_session_is_one_line_and_no_scene(

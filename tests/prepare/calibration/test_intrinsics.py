@@ -218,6 +218,19 @@ def test_spread_out_prefers_different_views(detector: BoardDetector) -> None:
     assert {id(view) for view in chosen} >= {id(view) for view in different[1:]}
 
 
+def test_a_flipped_video_is_told_as_such(detector: BoardDetector, clip: list[np.ndarray]) -> None:
+    flipped = [np.ascontiguousarray(frame[:, ::-1]) for frame in clip]
+    with pytest.raises(SplashbenchError, match=r"the board is seen mirrored.*the video is flipped, or the board was"):
+        calibrate(flipped, detector, "cameras/1/intrinsics/GX010001.MP4")
+    with pytest.raises(SplashbenchError, match="usable in 0 of 28 frames"):  # no board at all is no mirrored one
+        calibrate([np.full_like(frame, 90) for frame in clip], detector, "cameras/1/intrinsics/GX010001.MP4")
+
+
+def test_photographs_are_called_photographs(detector: BoardDetector, clip: list[np.ndarray], tmp_path: Path) -> None:
+    with pytest.raises(SplashbenchError, match=r"2 of 2 photographs.*take photographs of the board again"):
+        calibrate(clip[:2], detector, str(tmp_path))
+
+
 def test_coverage_counts_cells() -> None:
     assert coverage(np.array([[1.0, 1.0], [2.0, 2.0], [479.0, 269.0]]), (WIDTH, HEIGHT)) == 2 / 48
 

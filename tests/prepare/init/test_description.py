@@ -12,6 +12,7 @@ import pytest
 from splashbench import toml
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
+from splashbench.files import write_png
 from splashbench.prepare.init.board_guess import guess_board
 from splashbench.prepare.init.description import describe
 from splashbench.prepare.init.discovery import FoundRecording, find_recordings
@@ -207,3 +208,73 @@ def test_wrong_usage(tmp_path: Path, arguments: list[str], capsys: pytest.Captur
         main(["prepare", str(tmp_path), *arguments])
     assert stopped.value.code == 2
     assert "prepare" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_cameras_invents_none(folder: Path) -> None:
+    """Exports, a camera's old takes and a film of the people at work lie about in most sessions."""
+    busy = []
+    for k in range(6):
+        busy.append(cv2.circle(scenery(), (60 + 30 * k, 90), 12, (250, 20 * k, 20), -1))
+    for name in ("exports/preview.mp4", "cam1/old/GX010007.MP4", "people.mp4"):
+        write_clip(folder / name, busy)
+    found = describe(folder, 0.03)
+    assert found.cameras == ("cam1", "cam2", "cam3")
+    told = " ".join(found.to_do)
+    assert "exports-preview was not taken for a camera: it shows only" in told
+    assert "cam1-old was not taken for a camera: it lies within the folder of camera cam1" in told
+    assert "# Not used:" in (folder / "session.toml").read_text()
+    assert toml.load(folder / "session.toml")["recordings"]["pour"]["cam1"] == ["cam1/GX010003.MP4"]
+
+
+def checkerboard(tilt: float, shift: float) -> np.ndarray:
+    """Eight by five squares in a 640x360 picture, tilted and shifted."""
+    squares = (np.indices((5, 8)).sum(0) % 2 * 255).astype(np.uint8)
+    print_ = cv2.copyMakeBorder(squares.repeat(60, 0).repeat(60, 1), 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+    height, width = print_.shape
+    corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
+    seen = np.float32([[100, 60], [470, 60 + 40 * tilt], [470, 300 - 40 * tilt], [100, 300]]) + np.float32([shift, 0])
+    homography = cv2.getPerspectiveTransform(corners, seen)
+    return cv2.warpPerspective(
+        cv2.cvtColor(print_, cv2.COLOR_GRAY2RGB),
+        homography,
+        (640, 360),
+        dst=scenery(640, 360),
+        borderMode=cv2.BORDER_TRANSPARENT,
+    )
+
+
+def test_checkerboards_and_photographs_are_described(tmp_path: Path) -> None:
+    from splashbench.prepare.session import Session
+
+    session = tmp_path / "monday"
+    for camera in ("cam1", "cam2"):
+        for k in range(6):
+            write_png(session / camera / f"intrinsics/IMG_{k}.png", checkerboard(0.1 * k, 12.0 * k))
+            write_png(session / camera / f"static/IMG_{k}.png", scenery(640, 360))
+        write_clip(session / camera / "GX010003.MP4", [scenery(640, 360, seed=k) for k in range(6)])
+    found = describe(session, 0.03)
+    described = toml.load(session / "session.toml")
+    assert described["board"] == {"kind": "checkerboard", "squares_x": 8, "squares_y": 5, "square_metres": 0.03}
+    assert described["recordings"]["intrinsics"] == {c: [f"{c}/intrinsics"] for c in ("cam1", "cam2")}
+    assert described["recordings"]["static"] == {c: [f"{c}/static"] for c in ("cam1", "cam2")}
+    assert described["recordings"]["pour"]["cam1"] == ["cam1/GX010003.MP4"]
+    assert found.cameras == ("cam1", "cam2")
+    Session.open(session)
+
+
+def test_photographs_without_a_telling_name_are_looked_at(tmp_path: Path) -> None:
+    for k in range(6):
+        write_png(tmp_path / f"a/{k}.png", checkerboard(0.1 * k, 14.0 * k))
+        write_png(tmp_path / f"b/{k}.png", scenery(640, 360))
+    board, rest = (inspect_recording([tmp_path / name], MarkerFinder()) for name in "ab")
+    shown = assign([recording("a"), recording("b")], {("a",): board, ("b",): rest})
+    assert {f.files[0]: f.subject for f in shown} == {"a": "intrinsics", "b": "static"}
+
+
+def test_a_mirrored_board_is_told() -> None:
+    images = [np.ascontiguousarray(cv2.cvtColor(with_board(0.1 * k, 5.0 * k), cv2.COLOR_RGB2GRAY)) for k in range(5)]
+    plain, mirrored = guess_board(images), guess_board([np.ascontiguousarray(image[:, ::-1]) for image in images])
+    assert plain is not None
+    assert mirrored is not None
+    assert (plain.mirrored, mirrored.mirrored) == (False, True)
+    assert (mirrored.squares_x, mirrored.squares_y) == (8, 5)

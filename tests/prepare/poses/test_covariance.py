@@ -107,6 +107,67 @@ def test_twice_the_noise_is_twice_the_deviation_without_being_told(truth: pycolm
     assert deviations[1] / deviations[0] == pytest.approx(2, rel=0.05)
 
 
+@pytest.fixture(scope="module")
+def calibrated() -> pycolmap.Reconstruction:
+    """Six cameras whose lenses were all calibrated, as `prepare` describes them to COLMAP."""
+    pycolmap.set_random_seed(7)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 6, 1, 1
+    options.num_points3D, options.num_points2D_without_point3D = 150, 0
+    options.camera_model_id = pycolmap.CameraModelId.FULL_OPENCV
+    options.camera_params = [900.0, 900.0, 512.0, 384.0, *([0.0] * 8)]
+    return pycolmap.synthesize_dataset(options)
+
+
+@pytest.mark.slow
+def test_deviations_of_held_lenses_reach_the_poses(calibrated: pycolmap.Reconstruction) -> None:
+    """The lenses are off by what their calibration allows; the features alone would explain a small part of it."""
+    sigmas = np.array([3.0, 3.0, 2.0, 2.0, 2e-3, 2e-3, 2e-4, 2e-4, 0.0])
+    covariance = np.diag(sigmas**2)
+    covariance[0, 1] = covariance[1, 0] = 0.99 * 9.0  # fx and fy err together
+    root = np.linalg.cholesky(covariance + 1e-18 * np.eye(9))
+    fixed = set(calibrated.cameras)
+    rng = np.random.default_rng(8)
+    squares, total, by_features = [], [], []
+    for _ in range(DRAWS):
+        noisy = pycolmap.Reconstruction(calibrated)
+        for camera in noisy.cameras.values():
+            params = np.array(camera.params)
+            params[:9] += root @ rng.normal(0, 1, 9)
+            camera.params = params
+        for image in noisy.images.values():
+            for point in image.points2D:
+                point.xy = point.xy + rng.normal(0, NOISE_PX, 2)
+        refine(noisy, Workplace(Path(), {}, frozenset(fixed), 1))
+        found = pose_sigmas(noisy, names(noisy), fixed, False, dict.fromkeys(fixed, covariance))
+        assert found is not None
+        squares.append(remaining_errors(noisy, calibrated)[0] ** 2)
+        order = list(poses(calibrated))
+        total.append([found.centre[name] for name in order])
+        by_features.append([found.feature_centre[name] for name in order])
+    actual = np.sqrt(np.mean(squares, 0))
+    np.testing.assert_allclose(actual, np.mean(total, 0), rtol=0.25)
+    assert (actual > 1.5 * np.mean(by_features, 0)).all()
+
+
+@pytest.mark.slow
+def test_an_image_with_more_noise_than_the_rest_counts_with_its_own(calibrated: pycolmap.Reconstruction) -> None:
+    fixed, rng = set(calibrated.cameras), np.random.default_rng(9)
+    order = list(poses(calibrated))
+    squares, predicted = [], []
+    for _ in range(DRAWS):
+        noisy = pycolmap.Reconstruction(calibrated)
+        for image in noisy.images.values():
+            for point in image.points2D:
+                point.xy = point.xy + (5 if image.name == order[0] else 1) * rng.normal(0, NOISE_PX, 2)
+        refine(noisy, Workplace(Path(), {}, frozenset(fixed), 1))
+        sigmas = pose_sigmas(noisy, names(noisy), fixed)
+        assert sigmas is not None
+        squares.append(remaining_errors(noisy, calibrated)[0] ** 2)
+        predicted.append([sigmas.centre[name] for name in order])
+    np.testing.assert_allclose(np.sqrt(np.mean(squares, 0)), np.mean(predicted, 0), rtol=0.25)
+
+
 def test_nothing_is_said_about_one_camera_or_too_few_points(truth: pycolmap.Reconstruction) -> None:
     assert pose_sigmas(truth, names(truth)[:1], set(FIXED)) is None
     poor = pycolmap.Reconstruction(truth)

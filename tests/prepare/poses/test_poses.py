@@ -337,6 +337,18 @@ def test_a_camera_without_matches_is_named(capture: Capture, tmp_path: Path) -> 
         estimate_poses(capture.static | {"3": blank}, capture.lenses, capture.sweep, tmp_path)
 
 
+def test_colmap_says_nothing_and_the_error_speaks_of_what_there_is(
+    capture: Capture, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """COLMAP reports a pair that it cannot begin with as an error of its own."""
+    rng = np.random.default_rng(0)
+    noise = {camera: rng.integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8) for camera in "12"}
+    with pytest.raises(SplashbenchError, match=r"^static scene: no pose for camera 1, 2; .*film a hand-held \[sweep\]"):
+        estimate_poses(noise, {}, [], tmp_path)
+    told = "".join(capfd.readouterr())
+    assert ".cc:" not in told
+
+
 def test_a_board_lying_face_down_is_refused(capture: Capture, solved: Poses) -> None:
     sightings = board_sightings(capture, solved, np.random.default_rng(0))
     mirrored = [

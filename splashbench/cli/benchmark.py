@@ -1,0 +1,238 @@
+"""`splashbench benchmark`: methods on the real scenes with an estimate before, and a public leaderboard in a folder."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splashbench.cli import benchmark_site
+from splashbench.cli.arguments import add_lpips_weights, add_seeds, positive_number
+from splashbench.cli.command import add_command, add_group
+from splashbench.cli.output import emit, say
+from splashbench.cli.study_machines import add_machines, machine_options
+
+if TYPE_CHECKING:
+    from splashbench.benchmark.budgets import Entrant
+    from splashbench.benchmark.estimate import Estimate
+    from splashbench.study.job import Store
+    from splashbench.study.plan import StudyPlan
+
+_RUN_EXAMPLES = """\
+  splashbench benchmark run OUT --scenes REAL --dry-run                 how long it takes, and what it needs
+  splashbench benchmark run OUT --scenes all --budget full              the published schedules
+  splashbench benchmark run OUT --scenes REAL --methods splashsplat:best scaffold_4d my.py:Mine
+  splashbench benchmark run OUT --scenes REAL --on ray --cores 2        on all machines of a Ray cluster
+"""
+_RUN_EPILOG = f"""\
+examples:
+{_RUN_EXAMPLES}
+OUT gets leaderboard/index.html with the paper's figures beside, table.md with means over all scenes, results/, and what
+`splashbench study run` leaves. The same command goes on where it stopped; --retry makes failed runs again.
+Scenes are folders of scenes, folders that hold some, or `all`: the 20 of `splashbench download scenes`.
+
+Every method sees photographs at the size they have. The baselines' preset `quick` shrinks them to 400 pixels, which was
+no handicap at 240x160 and is one of 4.5 times at 1200x1800: so longest_side is set to 16384, unless you set it. What a
+fit takes longer for that is in the estimate. --budget quick is each method's preset `quick`; full is `best` of
+splashsplat and the published schedules of the baselines, which take days on a processor.
+"""
+
+
+def register(subparsers: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    actions = add_group(
+        subparsers,
+        "benchmark",
+        summary="methods on the real scenes, and a public leaderboard",
+        description="Run methods on many scenes up to the leaderboard, or make a site of what others hand in.",
+        epilog=f"examples:\n{_RUN_EXAMPLES}{benchmark_site.EXAMPLES}",
+    )
+    parser = add_command(
+        actions,
+        "run",
+        run,
+        summary="run methods on many scenes, up to the leaderboard",
+        description="Estimate the time, run and score methods on scenes, make the leaderboard.",
+        epilog=_RUN_EPILOG,
+    )
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the benchmark; finished runs in it are reused")
+    parser.add_argument(
+        "--scenes",
+        nargs="+",
+        action="extend",
+        required=True,
+        metavar="DIR",
+        help="scenes, folders of some, or `all` for the 20 released ones",
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="METHOD[:PRESET][:KEY=VALUE,...]",
+        help="names of methods, or FILE.py:CLASS (default: splashsplat, the three baselines, hull_points and "
+        "nearest_camera)",
+    )
+    parser.add_argument(
+        "--budget", choices=("quick", "full"), default="quick", help="presets of the methods (default: quick)"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="print the estimate, and make nothing")
+    add_seeds(parser, "of every method (default: 0)")
+    parser.add_argument(
+        "--timeout",
+        type=positive_number("minutes"),
+        metavar="MINUTES",
+        help="for each fit, and again for each rendering; a run that takes longer has failed",
+    )
+    parser.add_argument("--retry", action="store_true", help="repeat failed runs")
+    parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
+    parser.add_argument(
+        "--device",
+        choices=("cpu", "auto"),
+        default="cpu",
+        help="auto: a GPU for the methods that can use one, where there is one with gsplat (default: cpu)",
+    )
+    add_machines(parser)
+    add_lpips_weights(parser)
+    benchmark_site.register(actions)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench benchmark run`."""
+    from splashbench.benchmark.budgets import DEFAULT_METHODS, make_benchmark_plan, make_entrants
+    from splashbench.benchmark.estimate import as_json, estimate, load_rates, measure_machine
+    from splashbench.benchmark.scenes import find_scenes
+    from splashbench.score.image.lpips import load_lpips
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan
+    from splashbench.study.job import Store
+
+    scenes = find_scenes(arguments.scenes)
+    entrants = make_entrants(arguments.methods or DEFAULT_METHODS, arguments.budget)
+    plan = make_benchmark_plan(
+        entrants,
+        [str(scene) for scene in scenes],
+        arguments.budget,
+        seeds=list(dict.fromkeys(arguments.seeds)) or [0],
+        device=arguments.device,
+        timeout_seconds=60 * arguments.timeout if arguments.timeout else None,
+    )
+    rates, store = load_rates(), Store(arguments.out)
+    with_lpips = load_lpips(arguments.lpips_weights)[0] is not None
+    found = estimate(plan, store, rates, measure_machine(rates), with_lpips)
+    _tell(found, entrants, arguments.jobs or 1, arguments.device)
+    if not with_lpips:
+        say("LPIPS will be null: `splashbench download lpips-weights` fetches its weights, once")
+    if arguments.dry_run:
+        if arguments.json:
+            emit({"out": str(arguments.out), "estimate": as_json(found)})
+        return 0
+    options = ExecutionOptions(
+        **machine_options(arguments),
+        keep=arguments.keep,
+        retry=arguments.retry,
+        lpips_weights=arguments.lpips_weights,
+        tell=say,
+    )
+    tally = carry_out_plan(plan, arguments.out, options)
+    failed, files = _report(plan, store, arguments)
+    say(f"{tally.made} runs made{f', {tally.reused} reused' if tally.reused else ''}; {failed} failed")
+    for file in files:
+        say(f"wrote {file}")
+    if arguments.json:
+        emit(
+            {
+                "out": str(arguments.out),
+                "made": tally.made,
+                "kept": tally.reused,
+                "failed": failed,
+                "files": [str(file) for file in files],
+                "estimate": as_json(found),
+            }
+        )
+    return 0
+
+
+def _report(plan: StudyPlan, store: Store, arguments: argparse.Namespace) -> tuple[int, list[Path]]:
+    """Write the tables and the leaderboard; returns how many runs failed, and the files."""
+    from splashbench.cli.main import build_parser
+    from splashbench.errors import SplashbenchError
+    from splashbench.study.report import write_report
+    from splashbench.study.table import make_table
+
+    means = make_table(plan, store)
+    files = write_report(means, arguments.out, _command(arguments))
+    board = arguments.out / "leaderboard"
+    if not any(store.results.glob("*.json")):
+        raise SplashbenchError(f"no run of {arguments.out} has a result; see the lines above, and {files[0]}")
+    words = ["leaderboard", str(store.results), str(board), "--with-paper"]
+    parsed = build_parser().parse_args(words)
+    status = parsed.handler(parsed)
+    if status:
+        raise SplashbenchError(f"the leaderboard of {store.results} was not made; see the lines above")
+    return len(means.failed), [*files, board / "index.html"]
+
+
+def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> None:
+    """The estimate for people: one line, then what it rests on, method by method."""
+    from splashbench.study.execution import duration
+
+    seconds = found.seconds / jobs
+    unknown = f", and {', '.join(found.unknown)}, of which nothing is known" if found.unknown else ""
+    say(
+        f"{found.scenes} scene{'' if found.scenes == 1 else 's'}, {len(found.methods)} methods with the control, "
+        f"{found.left} runs to make: about "
+        f"{_long(seconds)}{unknown}; {found.memory_bytes / 1e9:.1f} GB of memory, {_disk(found.disk_bytes)} on the disk"
+    )
+    rows = [
+        [
+            each.label,
+            each.preset,
+            f"{each.made} of {each.runs}",
+            "unknown" if each.seconds is None else duration(each.seconds),
+            each.basis + (f"; photographs {each.beyond:.1f} times as large as those" if each.beyond > 1.05 else ""),
+        ]
+        for each in found.methods
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    for row in rows:
+        say("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0])).rstrip())
+    say(
+        f"This rests on the lines above, times {found.machine.factor:.2f} for this machine ({found.machine.cores} "
+        "cores), by a render. It may be twice as long, or half; with every run that is made it gets better."
+    )
+    if device != "cpu":
+        say("The estimate is for the processor: an H100 fitted the baselines in a sixth of the time (docs/gpu.md)")
+    native = [each.label for each in entrants if each.native]
+    if native:
+        say(f"Photographs at the size they have (longest_side=16384): {', '.join(native)}")
+    own = [each.label for each in entrants if each.id == "splashsplat"]
+    if own:
+        say(
+            f"{', '.join(own)}: its own settings show it the liquid's photographs at their size; those of the "
+            "background are shrunk, to 400 pixels in `quick` and 800 in `best`, which is its own handicap"
+        )
+
+
+def _long(seconds: float) -> str:
+    from splashbench.study.execution import duration
+
+    if seconds < 48 * 3600:
+        return duration(seconds)
+    return f"{seconds / 3600:.0f} h ({seconds / 86400:.1f} days)"
+
+
+def _disk(count: float) -> str:
+    return f"{max(0.1, math.ceil(count / 1e8) / 10):.1f} GB"
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    """The command line that makes the benchmark again."""
+    words = ["splashbench", "benchmark", "run", str(arguments.out)]
+    words += ["--budget", arguments.budget]
+    words += ["--device", arguments.device] if arguments.device != "cpu" else []
+    for flag in ("scenes", "methods", "seeds"):
+        values = getattr(arguments, flag)
+        words += [f"--{flag}", *map(str, values)] if values else []
+    return shlex.join(words)

@@ -1,0 +1,1 @@
+"""Tasks in child processes, several at once: on this machine, or on the machines of a Ray cluster."""

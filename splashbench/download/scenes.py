@@ -1,0 +1,245 @@
+"""The released scenes in a folder: fetched, unpacked, checked and given their times, and no step twice.
+
+The folder has the release's layout: real_scene/ and real_scene_crop/ with a folder for each scene, and meshes/. Times
+come from Table S1 by the name of a scene's folder (`splashbench.manifest`). scenes.json notes which were checked.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from splashbench.cache import cache_folder
+from splashbench.download.archive import ArchiveSource, note_path, obtain_archive
+from splashbench.download.fetch import PATIENT, Patience, alone
+from splashbench.download.meter import Meter
+from splashbench.download.unpacking import (
+    MESHES,
+    VARIANTS,
+    SceneArchive,
+    open_archive,
+    remove_leftovers,
+    require_room,
+)
+from splashbench.errors import SplashbenchError
+from splashbench.files import list_files, read_model, read_plain, require_folder_place, write_model, write_text
+from splashbench.manifest import load_archive, load_comparison, load_scenes
+from splashbench.scene import Scene
+from splashbench.scene.container import read_mesh
+from splashbench.scene.inspection import check_scene
+
+#: In the folder of the scenes: what was checked.
+STATE_FILE = "scenes.json"
+_ATTRIBUTION = "ATTRIBUTION.txt"
+# In the cache folder: where the scenes were put last.
+_REMEMBERED = "scenes_folder.txt"
+_MAX_PATH_BYTES = 4096
+_NEUROFLUID = ("watersphere", "watercube", "honeycone", "neurofluid")
+
+
+class CheckedScene(BaseModel):
+    """A scene that `scene check` has read whole. files, bytes: what it consisted of then; faults: what was found."""
+
+    model_config = ConfigDict(extra="forbid")
+    files: int = Field(ge=0)
+    bytes: int = Field(ge=0)
+    faults: list[str] = Field(default_factory=list)
+
+
+class _State(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    schema_version: Literal[1] = 1
+    scenes: dict[str, CheckedScene] = Field(default_factory=dict)
+
+
+@dataclass
+class SceneReport:
+    """A scene after the download. made: whether it was unpacked now; mesh: its container's scan, where there is one."""
+
+    name: str
+    variant: str
+    folder: Path
+    made: bool
+    frames: int
+    times_source: str
+    seconds: float
+    mesh: Path | None
+    faults: list[str] = field(default_factory=list)
+
+
+def require_names(names: Sequence[str]) -> list[str]:
+    """The scenes called `names`, in the order of Table S1; all 20 for none.
+
+    Raises SplashbenchError for a name that the release does not have.
+    """
+    known = load_scenes()
+    for name in names:
+        if name in known:
+            continue
+        if name.lower() in _NEUROFLUID:
+            raise SplashbenchError(_neurofluid_text())
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f", did you mean {near[0]!r}?" if near else "; there are bowl_001 to bowl_017 and tank_001 to tank_003"
+        raise SplashbenchError(f"the release has no scene {name!r}{hint}")
+    return [name for name in known if not names or name in names]
+
+
+def _neurofluid_text() -> str:
+    listed = any(facts.dataset == "NeuroFluid" for facts in load_comparison())
+    assert listed
+    return (
+        "NeuroFluid's scenes are in another archive, and data_manifest/ states no address of it: fetch them from where "
+        "their authors say (github.com/syguan96/NeuroFluid), and give their folders to `splashbench benchmark run "
+        "OUT --scenes` as they are"
+    )
+
+
+def download_scenes(
+    out: Path,
+    names: Sequence[str] = (),
+    variants: Sequence[str] = ("crop",),
+    by_hand: Path | None = None,
+    *,
+    tell: Callable[[str], None],
+    source: ArchiveSource | None = None,
+    patience: Patience = PATIENT,
+    check_again: bool = False,
+) -> list[SceneReport]:
+    """Fetch the archive and unpack the scenes `names` (all 20 for none) into `out`; what is there stays.
+
+    Args:
+        variants: "full", "crop" or both.
+        by_hand: the archive as somebody fetched it; nothing is fetched then.
+        check_again: read scenes again that were checked before.
+
+    Raises SplashbenchError where the archive cannot be had, is damaged or lacks a scene. Faults of scenes are reported.
+    """
+    out, source = Path(out), source or ArchiveSource.official()
+    chosen = require_names(names)
+    require_folder_place(out)
+    wanted = [(VARIANTS[variant], name) for variant in VARIANTS if variant in variants for name in chosen]
+    with alone(out / source.name, tell):
+        places = [out / folder / name for folder, name in wanted]
+        notes = (out / STATE_FILE, out / _ATTRIBUTION, note_path(out, source))
+        remove_leftovers([*places, *(out / MESHES / f"{name}.glb" for name in chosen), *notes])
+        missing = [pair for pair, place in zip(wanted, places) if not place.is_dir()]
+        if missing:
+            archive_path = obtain_archive(out, by_hand, source, tell=tell, patience=patience)
+            with open_archive(archive_path) as archive:
+                _unpack(archive, missing, chosen, out, tell)
+        _write_attribution(out)
+        reports = _checked(out, wanted, set(missing), check_again, tell)
+    _remember(out)
+    return reports
+
+
+def _unpack(
+    archive: SceneArchive,
+    missing: Sequence[tuple[str, str]],
+    chosen: Sequence[str],
+    out: Path,
+    tell: Callable[[str], None],
+) -> None:
+    contents = archive.contents
+    lacking = [f"{folder}/{name}" for folder, name in missing if (folder, name) not in contents.scenes]
+    if lacking:
+        more = f" and {len(lacking) - 3} more" if len(lacking) > 3 else ""
+        raise SplashbenchError(
+            f"{archive.path} holds no {', '.join(lacking[:3])}{more}; name the scenes that it holds, or fetch it again"
+        )
+    if contents.others:
+        first = contents.others[0][:80]
+        tell(f"left out: {len(contents.others)} files that are no part of the layout, such as {first!r}")
+    meshes = [name for name in chosen if name in contents.meshes and not (out / MESHES / f"{name}.glb").is_file()]
+    total = sum(contents.bytes_of(*pair) for pair in missing) + sum(contents.meshes[name].file_size for name in meshes)
+    require_room(out, total)
+    tell(f"unpacking {len(missing)} scenes{f' and {len(meshes)} scans of containers' if meshes else ''} into {out}")
+    done = 0
+    with closing(Meter("unpacking", max(1, total), 0)) as meter:
+
+        def seen(count: int) -> None:
+            nonlocal done
+            done += count
+            meter.show(done)
+
+        for name in meshes:
+            archive.unpack_mesh(name, out, seen)
+        for folder, name in missing:
+            archive.unpack_scene(folder, name, out, seen)
+
+
+def _checked(
+    out: Path, wanted: Sequence[tuple[str, str]], made: set[tuple[str, str]], again: bool, tell: Callable[[str], None]
+) -> list[SceneReport]:
+    """A report of every scene. Those that were checked are not read again while they have as many files and bytes."""
+    path, reports = out / STATE_FILE, []
+    state = read_model(path, _State) if path.is_file() else _State()
+    variant_of = {folder: variant for variant, folder in VARIANTS.items()}
+    for number, (folder, name) in enumerate(wanted, 1):
+        place, key = out / folder / name, f"{folder}/{name}"
+        listing = list_files(place)
+        known = state.scenes.get(key)
+        size = (len(listing.names), listing.bytes)
+        if known is None or again or (folder, name) in made or (known.files, known.bytes) != size:
+            tell(f"checking {key} ({number} of {len(wanted)})")
+            known = CheckedScene(files=size[0], bytes=size[1], faults=[*listing.faults, *check_scene(place)])
+            state.scenes[key] = known
+            write_model(path, state)
+        mesh = out / MESHES / f"{name}.glb"
+        report = SceneReport(
+            name=name,
+            variant=variant_of[folder],
+            folder=place,
+            made=(folder, name) in made,
+            frames=0,
+            times_source="",
+            seconds=0.0,
+            mesh=mesh if mesh.is_file() else None,
+            faults=list(known.faults),
+        )
+        if report.mesh is not None:
+            try:
+                read_mesh(report.mesh)
+            except SplashbenchError as error:
+                report.faults.append(str(error))
+        try:
+            scene = Scene.open(place)
+        except SplashbenchError as error:
+            report.faults = report.faults or [str(error)]
+        else:
+            report.frames, report.times_source = scene.n_frames, scene.times_source
+            report.seconds = float(scene.times[-1] - scene.times[0])
+        reports.append(report)
+    return reports
+
+
+def _write_attribution(out: Path) -> None:
+    archive = load_archive()
+    text = f"{archive.attribution}\nLicence: {archive.license}\nFrom: {archive.url}\n{archive.repository}\n"
+    path = out / _ATTRIBUTION
+    if not path.is_file():
+        write_text(path, text)
+
+
+def _remember(out: Path) -> None:
+    """Note where the scenes are, for `splashbench benchmark run --scenes all`."""
+    try:
+        write_text(cache_folder() / _REMEMBERED, f"{out.resolve()}\n")
+    except (OSError, SplashbenchError):
+        return  # a convenience: without a cache folder the user names the scenes' folder
+
+
+def remembered_folder() -> Path | None:
+    """The folder that `download_scenes` filled last on this machine, as far as it is still there."""
+    try:
+        text = read_plain(cache_folder() / _REMEMBERED, _MAX_PATH_BYTES).decode("utf-8")
+    except (OSError, SplashbenchError, UnicodeDecodeError):
+        return None
+    folder = Path(text.strip())
+    return folder if text.strip() and folder.is_dir() else None

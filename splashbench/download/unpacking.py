@@ -1,0 +1,236 @@
+"""Unpacking the archive of the released scenes without trusting it: what the known layout holds, and nothing else.
+
+A name outside the layout is never written, wherever it would lead; it is counted and told. A file that claims to be in
+the layout is refused as a link, encrypted, larger than its kind ever is, or packed more tightly than real files are.
+Each scene is written beside its place and renamed onto it, so that a folder with a scene's name holds all of it.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from splashbench.download.archive import MAX_ARCHIVE_BYTES
+from splashbench.download.meter import megabytes
+from splashbench.errors import SplashbenchError, one_line
+from splashbench.files import atomic_directory, atomic_path, is_staged_for, open_plain, raise_if_disk_full
+from splashbench.manifest import load_scenes
+
+#: The folders of the layout: photographs as recorded, and cut to the container.
+VARIANTS = {"full": "real_scene", "crop": "real_scene_crop"}
+MESHES = "meshes"
+#: Entries of the archive at most, bytes of its list of them, and how much larger than the archive all of it may be.
+MAX_ENTRIES, MAX_LIST_BYTES, MAX_GROWTH = 200_000, 64 << 20, 20
+# Bytes of one file by its kind, and how tightly one that is larger than `_SMALL` may be packed: real ones are not.
+_LARGEST = {".jpg": 64 << 20, ".jpeg": 64 << 20, ".png": 64 << 20, ".json": 64 << 20, ".npz": 1 << 30, ".glb": 1 << 30}
+_SMALL, _TIGHTEST = 8 << 20, 200
+_BLOCK = 1 << 20
+_WORD = r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}"
+_IN_SCENE = re.compile(
+    rf"(?:ims/{_WORD}/{_WORD}\.(?:jpg|jpeg|png)|seg/{_WORD}/{_WORD}\.png|container_mask/{_WORD}\.png"
+    r"|train_meta\.json|test_meta\.json|init_pt_cld\.npz)"
+)
+_ROOT = r"(?:[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}/){0,3}?"
+_SCENE_FILE = re.compile(rf"{_ROOT}(real_scene|real_scene_crop)/({_WORD})/(.+)", re.DOTALL)
+_MESH_FILE = re.compile(rf"{_ROOT}meshes/({_WORD})\.glb")
+# The records at the end of a zip file that say where its list is (APPNOTE 6.3.10, 4.3.14 to 4.3.16).
+_END, _END_BYTES, _LOCATOR, _LOCATOR_BYTES, _END64 = b"PK\5\6", 22, b"PK\6\7", 20, b"PK\6\6"
+_SATURATED = 0xFFFFFFFF
+
+
+@dataclass
+class Contents:
+    """What an archive holds of the layout.
+
+    Attributes:
+        scenes: (folder, scene), such as ("real_scene_crop", "bowl_001") -> path in the scene -> entry.
+        meshes: scene -> entry of its scanned container.
+        others: names that are no part of the layout, in the archive's order.
+    """
+
+    scenes: dict[tuple[str, str], dict[str, zipfile.ZipInfo]] = field(default_factory=dict)
+    meshes: dict[str, zipfile.ZipInfo] = field(default_factory=dict)
+    others: list[str] = field(default_factory=list)
+
+    def bytes_of(self, folder: str, scene: str) -> int:
+        """Of all files of a scene, unpacked."""
+        return sum(entry.file_size for entry in self.scenes[folder, scene].values())
+
+
+class SceneArchive:
+    """The archive, opened; `contents` are checked. Use `open_archive`."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, contents: Contents) -> None:
+        self.path, self._zip, self.contents = path, archive, contents
+
+    def unpack_scene(self, folder: str, scene: str, out: Path, seen: Callable[[int], None]) -> None:
+        """Write a scene to `out`/`folder`/`scene`, whole or not at all. seen: is told the bytes of each block."""
+        place = Path(out, folder, scene)
+        entries = self.contents.scenes[folder, scene]
+        with atomic_directory(place) as staging:
+            for name, entry in sorted(entries.items()):
+                target = staging / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                self._copy(entry, target, seen)
+
+    def unpack_mesh(self, scene: str, out: Path, seen: Callable[[int], None]) -> Path:
+        """Write the scan of a scene's container to `out`/meshes; returns its path."""
+        place = Path(out, MESHES, f"{scene}.glb")
+        with atomic_path(place) as temporary:
+            self._copy(self.contents.meshes[scene], temporary, seen)
+        return place
+
+    def _copy(self, entry: zipfile.ZipInfo, target: Path, seen: Callable[[int], None]) -> None:
+        written = 0
+        try:
+            with self._zip.open(entry) as source, target.open("xb") as stream:
+                while block := source.read(_BLOCK):
+                    written += len(block)
+                    if written > entry.file_size:
+                        raise zipfile.BadZipFile("it is longer than the archive says")
+                    stream.write(block)
+                    seen(len(block))
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+            raise self._damaged(entry, str(error) or type(error).__name__) from None
+        except OSError as error:
+            raise_if_disk_full(target, error)
+            raise
+        if written != entry.file_size:
+            raise self._damaged(entry, f"it has {written} of {entry.file_size} bytes")
+
+    def _damaged(self, entry: zipfile.ZipInfo, reason: str) -> SplashbenchError:
+        return SplashbenchError(
+            f"{self.path}: {_shown(entry.filename)} is damaged ({one_line(reason)}); remove the archive, and fetch it "
+            "again"
+        )
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[SceneArchive]:
+    """Yield the archive `path`, whose entries have been checked; nothing is written.
+
+    Raises SplashbenchError for what is no zip archive, is damaged, or holds what no release would.
+    """
+    path = Path(path)
+    with open_plain(path, MAX_ARCHIVE_BYTES) as (stream, size):
+        _check_list(path, stream, size)
+        try:
+            archive = zipfile.ZipFile(stream)
+        except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error) as error:
+            raise SplashbenchError(f"{path} is no whole zip archive ({one_line(str(error))}); fetch it again") from None
+        with archive:
+            yield SceneArchive(path, archive, _contents(path, archive.infolist(), size))
+
+
+def _check_list(path: Path, stream: BinaryIO, size: int) -> None:
+    """Raise SplashbenchError where the archive's list of entries, which is read whole, is not to be believed."""
+    tail = min(size, _END_BYTES + 0xFFFF + _LOCATOR_BYTES)
+    stream.seek(size - tail)
+    end = stream.read(tail)
+    position = end.rfind(_END)
+    if position < 0 or len(end) - position < _END_BYTES:
+        raise SplashbenchError(f"{path} is no whole zip archive (it has no end); fetch it again")
+    entries, bytes_ = struct.unpack_from("<HI", end, position + 10)
+    before = position - _LOCATOR_BYTES
+    if before >= 0 and end[before : before + 4] == _LOCATOR:
+        (place,) = struct.unpack_from("<Q", end, before + 8)
+        stream.seek(min(place, size))
+        record = stream.read(56)
+        if len(record) == 56 and record[:4] == _END64:
+            entries, bytes_ = struct.unpack_from("<QQ", record, 32)
+    elif bytes_ == _SATURATED:
+        raise SplashbenchError(f"{path} is no whole zip archive (its list has no size); fetch it again")
+    stream.seek(0)
+    if entries > MAX_ENTRIES or bytes_ > MAX_LIST_BYTES:
+        raise SplashbenchError(f"{path} lists {entries} files; the release has no more than {MAX_ENTRIES}")
+
+
+def _contents(path: Path, entries: Sequence[zipfile.ZipInfo], size: int) -> Contents:
+    if len(entries) > MAX_ENTRIES:
+        raise SplashbenchError(f"{path} lists {len(entries)} files; the release has no more than {MAX_ENTRIES}")
+    if sum(entry.compress_size for entry in entries) > size:
+        raise SplashbenchError(f"{path} holds files that lie over each other; fetch it again")
+    known, contents = load_scenes(), Contents()
+    for entry in entries:
+        if entry.is_dir():
+            continue
+        name = entry.filename
+        if (match := _SCENE_FILE.fullmatch(name)) and match[2] in known and _IN_SCENE.fullmatch(match[3]):
+            place = contents.scenes.setdefault((match[1], match[2]), {})
+            taken = match[3] in place
+            place.setdefault(match[3], entry)
+        elif (match := _MESH_FILE.fullmatch(name)) and match[1] in known:
+            taken = match[1] in contents.meshes
+            contents.meshes.setdefault(match[1], entry)
+        else:
+            contents.others.append(name)
+            continue
+        if taken:
+            raise SplashbenchError(f"{path} holds {_shown(name)} twice; fetch it again")
+        fault = _fault(entry)
+        if fault:
+            raise SplashbenchError(f"{path}: {_shown(name)} {fault}; nothing was unpacked")
+    listed = [*(entry for scene in contents.scenes.values() for entry in scene.values()), *contents.meshes.values()]
+    total = sum(entry.file_size for entry in listed)
+    if total > max(MAX_GROWTH * size, _SMALL):
+        raise SplashbenchError(
+            f"{path} has {megabytes(size)} and unpacks to {megabytes(total)}, as no release does; nothing was unpacked"
+        )
+    if not contents.scenes:
+        raise SplashbenchError(f"{path} holds no scene of the release ({', '.join(VARIANTS.values())}); give another")
+    return contents
+
+
+def _fault(entry: zipfile.ZipInfo) -> str:
+    """Why an entry whose name is in the layout is not unpacked; empty where it is."""
+    kind = stat.S_IFMT(entry.external_attr >> 16)
+    if kind not in (0, stat.S_IFREG):
+        return "is a link" if kind == stat.S_IFLNK else "is no file"
+    if entry.flag_bits & 0x1:
+        return "is encrypted"
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        return "is packed in a way that the release does not use"
+    largest = _LARGEST[Path(entry.filename).suffix]
+    if entry.file_size > largest:
+        return f"has {entry.file_size} bytes, more than {largest}"
+    if entry.file_size > _SMALL and entry.file_size > _TIGHTEST * max(1, entry.compress_size):
+        return f"is packed {entry.file_size // max(1, entry.compress_size)} times, more than {_TIGHTEST}"
+    return ""
+
+
+def _shown(name: str) -> str:
+    return one_line(name)[:120]
+
+
+def remove_leftovers(places: Iterable[Path]) -> None:
+    """Remove what a killed process left half-made beside `places`. Only while nobody else unpacks there."""
+    for place in places:
+        if place.parent.is_dir():
+            for path in place.parent.glob(".tmp-*"):
+                if is_staged_for(path, place):
+                    if path.is_dir() and not path.is_symlink():
+                        shutil.rmtree(path, ignore_errors=True)
+                    else:
+                        path.unlink(missing_ok=True)
+
+
+def require_room(out: Path, needed: int) -> None:
+    """Raise SplashbenchError where the disk of `out` has less than `needed` bytes."""
+    place = Path(out).resolve()
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if free < needed:
+        raise SplashbenchError(
+            f"{out} has room for {megabytes(free)}, and the scenes take {megabytes(needed)}; free some space, or name "
+            "fewer scenes, or one --variant"
+        )

@@ -1,0 +1,114 @@
+"""Methods that try to write their own outcome, clock or renders. Given to `run` as FILE.py:CLASS."""
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import time as clock
+from pathlib import Path
+
+from splashbench.harness.channel import FIT_ENDS, SAVED, Channel
+from splashbench.harness.contract import Fitted, Run
+from splashbench.scene import TrainingScene
+
+sys.path.insert(0, str(Path(__file__).parent))
+from example_methods import Good, _Settings
+
+
+def channel() -> Channel:
+    """The harness's end of the line, found in this process's memory."""
+    return next(thing for thing in gc.get_objects() if isinstance(thing, Channel))
+
+
+class WritesOutcome(Good):
+    """Leaves an outcome where the harness once read one, and ends its process."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        outcome = {"status": "ok", "seconds": 0.001, "settings": {"blue": 1.0}}
+        for folder in (run.directory, run.directory.parent):
+            (folder / "outcome.json").write_text(json.dumps(outcome))
+        os._exit(0)
+
+
+class EndsEarly(Good):
+    """Tells the end of the fit at its start, and goes on."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        line = channel()
+        line.mark(FIT_ENDS)
+        line.mark(SAVED)
+        line.finish({"status": "ok"})
+        clock.sleep(3)
+        request = json.loads((run.directory.parent / "request.json").read_text())
+        super().fit(scene, config, run).save(Path(request["model"]))
+        os._exit(0)
+
+
+class EndsTwice(Good):
+    """Tells the end of the fit at its start, and lets the harness tell it once more."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        channel().mark(FIT_ENDS)
+        clock.sleep(1)
+        return super().fit(scene, config, run)
+
+
+class ClaimsOverhead(Good):
+    """Says that all of its time went into reading what was fitted before."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        clock.sleep(1)
+        run._overhead_seconds = 1e6
+        run.reused["everything"] = 0.0
+        return super().fit(scene, config, run)
+
+
+class RendersNothing(Good):
+    """Tells that it has rendered, and ends its process."""
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        channel().finish({"status": "ok", "render_fps": 1e9})
+        os._exit(0)
+
+
+class ChangesModel(Good):
+    """Makes its model larger once its bytes were counted."""
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        (directory / "more.bin").write_bytes(b"0" * 5000)
+        return super().load(directory, scene)
+
+
+class KeepsInScratch(Good):
+    """Leaves most of its model in the scratch folder of the fit."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        (run.directory / "rest.bin").write_bytes(b"0" * 5000)
+        fitted = super().fit(scene, config, run)
+        save = fitted.save
+
+        def with_pointer(directory: Path) -> None:
+            save(directory)
+            (directory / "rest.txt").write_text(str(run.directory / "rest.bin"))
+
+        fitted.save = with_pointer  # type: ignore[method-assign]
+        return fitted
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        Path((directory / "rest.txt").read_text()).read_bytes()
+        return super().load(directory, scene)
+
+
+class LeavesDaemon(Good):
+    """Starts a process of another session and environment, which would go on fitting."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        code = "import time\nwhile True: time.sleep(1)"
+        subprocess.Popen(
+            ["/usr/bin/env", "-i", sys.executable, "-c", code, os.environ["SPLASHBENCH_TEST_MARK"]],
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        return super().fit(scene, config, run)
