@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -105,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.benchmark.estimate import as_json, estimate, load_rates, measure_machine
     from splashbench.benchmark.scenes import find_scenes
     from splashbench.score.image.lpips import load_lpips
-    from splashbench.study.execution import ExecutionOptions, carry_out_plan
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed
     from splashbench.study.job import Store
 
     scenes = find_scenes(arguments.scenes)
@@ -136,7 +137,9 @@ def run(arguments: argparse.Namespace) -> int:
         tell=say,
     )
     tally = carry_out_plan(plan, arguments.out, options)
-    failed, files = _report(plan, store, arguments)
+    with claimed(store):
+        _remove_leftovers(arguments.out)
+        failed, files = _report(plan, store, arguments)
     say(f"{tally.made} runs made{f', {tally.reused} reused' if tally.reused else ''}; {failed} failed")
     for file in files:
         say(f"wrote {file}")
@@ -152,6 +155,15 @@ def run(arguments: argparse.Namespace) -> int:
             }
         )
     return 0
+
+
+def _remove_leftovers(out: Path) -> None:
+    """Remove what an earlier process left that was killed while it wrote tables, charts or the leaderboard."""
+    for path in (*out.glob(".tmp-*"), *(out / "leaderboard").glob(".tmp-*")):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _report(plan: StudyPlan, store: Store, arguments: argparse.Namespace) -> tuple[int, list[Path]]:

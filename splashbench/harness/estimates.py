@@ -24,6 +24,8 @@ _FILE = "fit_times.json"
 _KEPT = 500
 #: Scenes whose pixels differ by no more than this factor count as of one size.
 _ALIKE = 1.25
+#: Fits of less are not worth a line.
+TOLD_SECONDS = 10.0
 
 
 class _Fit(BaseModel):
@@ -40,16 +42,18 @@ class _Fits(BaseModel):
 
 
 def estimate(identity: Identity, scene: Scene, kept: Sequence[int]) -> str:
-    """A line on how long the fit that `identity` names may take; it says so where no earlier fit tells.
+    """A line on how long the fit that `identity` names may take; "" where no earlier fit tells, or it is over at once.
 
     kept: the timesteps that the method sees.
     """
     key, pixels = _key(identity), _pixels(scene, kept)
     like = [fit for fit in _read().fits if fit.key == key and 1 / _ALIKE <= fit.pixels / pixels <= _ALIKE]
     if not like:
-        return "no estimate of the time: nothing like it was fitted on this machine before"
+        return ""
     own = [fit for fit in like if fit.scene == scene.name] or like
     seconds = statistics.median(fit.seconds for fit in own)
+    if seconds < TOLD_SECONDS:
+        return ""
     runs = "one fit" if len(own) == 1 else f"{len(own)} fits"
     of = "this scene" if own[0].scene == scene.name else f"a scene of this size ({one_line(own[0].scene)[:60]})"
     return f"about {_duration(seconds)} to fit, as {runs} with these settings of {of} took on this machine"

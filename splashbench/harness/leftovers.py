@@ -58,7 +58,7 @@ def clear_leftovers(out: Path) -> list[str]:
         for path in beside:
             if (path / MARK).is_file():
                 places.append(path)
-            else:
+            elif _age(path) > _YOUNG_SECONDS:
                 lines.append(f"{path} may be left from a killed command; remove it if nothing writes {out} now")
     for path in places:
         if _is_left(path):
@@ -72,6 +72,14 @@ def _is_own_folder(path: Path) -> bool:
         return path.is_dir() and not path.is_symlink() and path.stat().st_uid == os.getuid()
     except OSError:
         return False
+
+
+def _age(path: Path) -> float:
+    """Seconds since something was last added to the folder `path`; 0 where it has gone meanwhile."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def _is_left(folder: Path) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from splashbench.child import child_command, raise_if_disk_was_full
+from splashbench.errors import one_line
 from splashbench.files import tree_bytes, write_model
 from splashbench.harness import keeper
 from splashbench.harness.clock import FitTime, Report, fit_time, frames_per_second, state_seconds
@@ -20,6 +21,7 @@ from splashbench.harness.outputs import require_liquid, require_views, tree_dige
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene
 from splashbench.submission import Checkpoint, Record, Status
+from splashbench.submission.submission import unusable_files
 
 
 def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
@@ -33,6 +35,10 @@ def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     if outcome.status != Status.OK:
         return _failed(record, outcome, watched)
     model = Path(request.model)
+    faults = unusable_files(model)
+    if faults:
+        reason = one_line(f"what the method saved is no model: {faults[0]}").replace(f"{model}/", "model/")
+        return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
     storage = tree_bytes(model)
     time = _fit_time(watched, storage)
     if time is None:

@@ -118,7 +118,8 @@ def run_method(
     )
     kept = kept_timesteps(scene.n_frames, withheld)
     for line in (*clear_leftovers(out), estimates.estimate(identity, scene, kept)):
-        tell(line)
+        if line:
+            tell(line)
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=[scene_directory]) as staging,
         scratch_folder() as scratch,

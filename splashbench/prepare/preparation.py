@@ -159,13 +159,21 @@ class Preparation:
             "start_s": fit.start_s,
             "clock_rate": fit.clock_rate,
             # The reference agrees with itself without bound, which JSON cannot say.
-            "confidence": fit.confidence if np.isfinite(fit.confidence) else None,
+            "confidence": _finite(fit.confidence),
             "residual_rms_s": fit.residual_rms_s,
             "windows": fit.n_windows,
+            "agreement": fit.agreement,
+            "drift_interval": _finite(fit.drift_interval),
+            "interval_s": _finite(fit.interval_s),
+            "earlier_sound_s": fit.echo_s,
             "status": fit.status,
             "seams": [{"time_s": seam.time_s, "gap_s": seam.gap_s} for seam in self.synced.seams[camera]],
             "sequence_offset_s": self.sequence.offsets_s.get(camera),
         }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _recording(video: VideoInfo) -> dict[str, Any]:

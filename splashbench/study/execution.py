@@ -6,6 +6,7 @@ A run that fails has an entry like any other. One whose machine is lost is made 
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,7 +21,8 @@ from splashbench.cluster.place import workers_at
 from splashbench.cluster.work import Ended, Needs, Work, Workers
 from splashbench.errors import SplashbenchError
 from splashbench.files import require_folder_place, write_model, write_text
-from splashbench.score.image.lpips import load_lpips
+from splashbench.score.image.lpips import WEIGHTS_VARIABLE, load_lpips
+from splashbench.score.image.weights import weights_path
 from splashbench.study.commit import commit, commit_failure, new_attempt, recover
 from splashbench.study.job import ERROR, Attempt, Job, RunEntry, Store, carry_out, carry_out_file
 from splashbench.study.plan import PlannedRun, StudyPlan
@@ -82,7 +84,7 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
 
     Raises SplashbenchError where `out` holds other files, where another study runs in it, and for a full disk.
     """
-    store = Store(out)
+    store, options = Store(out), replace(options, lpips_weights=_weights(options))
     with claimed(store):
         selected = [run for run in plan.runs if options.only is None or run.variant.name in options.only]
         with_lpips = "lpips" in plan.spec.metrics and load_lpips(options.lpips_weights)[0] is not None
@@ -112,6 +114,15 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
                 else:
                     _run_all(jobs, replace(needs, gpus=0) if is_reference else needs, workers, store, progress)
         return Tally(progress.ended, len({run.digest for run in selected}) - len(missing))
+
+
+def _weights(options: ExecutionOptions) -> Path | None:
+    """The file of LPIPS weights. Other machines have to be told of one that this machine would find by itself."""
+    if options.lpips_weights is not None or options.on is None:
+        return options.lpips_weights
+    named = os.environ.get(WEIGHTS_VARIABLE)
+    found = Path(named) if named else weights_path()
+    return found if named or found.is_file() else None
 
 
 def _needs(plan: StudyPlan, options: ExecutionOptions) -> Needs:

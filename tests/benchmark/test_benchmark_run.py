@@ -49,6 +49,14 @@ def test_the_same_command_reuses_what_is_there(made: Path, real: Path, capsys: p
     assert "all of its runs are there" in said.err
 
 
+def test_what_a_killed_one_left_is_removed(made: Path, real: Path) -> None:
+    for name in (".tmp-0a1b2c3d-leaderboard", "leaderboard/.tmp-0a1b2c3d-x"):
+        (made / name).mkdir()
+    (made / ".tmp-0a1b2c3d-table.md").write_text("half")
+    assert main([*run(made, real), "nearest_camera"]) == 0
+    assert list(made.rglob(".tmp-*")) == []
+
+
 def test_a_dry_run_makes_nothing(real: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     words = ["benchmark", "run", str(out), "--scenes", str(real), "--dry-run"]

@@ -150,7 +150,7 @@ def test_hostile_text_is_harmless_and_bounded(place: Path, tmp_path: Path, expla
     worst = HOSTILE * 1000
     write(
         place,
-        scene=worst,
+        scene=worst[:1000],
         decisions=hostile(),
         stages={f"{worst}{n}": 1e15 for n in range(1000)},
         notes={worst: (HOSTILE * 20)[:500]},

@@ -358,6 +358,7 @@ def tree(folder: Path) -> dict[str, str]:
     return {name: sha256_file(folder / name) for name in list_files(folder).names if not name.endswith(".lock")}
 
 
+@pytest.mark.slow
 def test_killed_twenty_times_the_scenes_have_the_same_bytes(archive: Path, server: Any, tmp_path: Path) -> None:
     """Killed while it fetches, unpacks and checks, at moments spread over all of it."""
     source = on_drive(server, archive.read_bytes(), pause=0.004)

@@ -6,11 +6,12 @@ import os
 import subprocess
 import sys
 import time as clock
+from collections.abc import Callable
 from pathlib import Path
 
 from splashbench.harness.channel import FIT_ENDS, SAVED, Channel
-from splashbench.harness.contract import Fitted, Run
-from splashbench.scene import TrainingScene
+from splashbench.harness.contract import Fitted, Render, Run
+from splashbench.scene import Camera, Particles, TrainingScene
 
 sys.path.insert(0, str(Path(__file__).parent))
 from example_methods import Good, _Settings
@@ -112,3 +113,34 @@ class LeavesDaemon(Good):
             stderr=subprocess.DEVNULL,
         )
         return super().fit(scene, config, run)
+
+
+class _SavesMore(Fitted):
+    """A fitted model that leaves something else beside its files, as `leave` does."""
+
+    def __init__(self, fitted: Fitted, leave: Callable[[Path], None]) -> None:
+        self._fitted, self._leave = fitted, leave
+
+    def render(self, camera: Camera, time: float) -> Render:
+        return self._fitted.render(camera, time)
+
+    def particles(self) -> Particles | None:
+        return self._fitted.particles()
+
+    def save(self, directory: Path) -> None:
+        self._fitted.save(directory)
+        self._leave(directory)
+
+
+class SavesPipe(Good):
+    """Leaves a pipe in its model, which waits for whoever opens it."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        return _SavesMore(super().fit(scene, config, run), lambda folder: os.mkfifo(folder / "weights.npz"))
+
+
+class SavesLink(Good):
+    """Leaves a link to a file that is nobody's business."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        return _SavesMore(super().fit(scene, config, run), lambda folder: (folder / "more").symlink_to("/proc/kcore"))

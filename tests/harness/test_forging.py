@@ -173,14 +173,17 @@ def test_what_a_killed_run_left_is_removed_by_the_next_or_named(
     for folder in left:
         _killed_run(folder)
     other, unmarked = tmp_path / ".tmp-0123abcd-another", tmp_path / ".tmp-89abcdef-out"
-    for folder in (other, unmarked):
+    for folder in (other, unmarked, young := tmp_path / ".tmp-00000000-out"):
         folder.mkdir()
+    os.utime(unmarked, (time.time() - 3600,) * 2)
     lines: list[str] = []
     assert _run("ClaimsOverhead", balls_directory, tmp_path / "out", tell=lines.append).status == Status.OK
     assert not any(folder.exists() for folder in left)
     assert other.is_dir()
     assert unmarked.is_dir()
     assert [line for line in lines if str(unmarked) in line and "remove it if" in line]
+    assert young.is_dir()
+    assert not [line for line in lines if str(young) in line]
     assert sum(line.startswith("removed ") for line in lines) == 2
     assert list((tmp_path / "temporary").iterdir()) == []
     assert not (tmp_path / "out" / leftovers.MARK).exists()
@@ -197,3 +200,11 @@ def test_a_run_under_way_keeps_its_folders(tmp_path: Path, monkeypatch: pytest.M
         assert scratch.is_dir()
         assert staging.is_dir()
     assert not scratch.exists()
+
+
+@pytest.mark.parametrize(("name", "said"), [("SavesPipe", "weights.npz"), ("SavesLink", "more")])
+def test_pipes_and_links_are_no_model(balls_directory: Path, tmp_path: Path, name: str, said: str) -> None:
+    submission = _run(name, balls_directory, tmp_path / "out", timeout_seconds=60)
+    assert submission.status == Status.CRASHED
+    assert submission.reason.startswith(f"what the method saved is no model: model/{said}")
+    assert not (tmp_path / "out" / "model").exists()

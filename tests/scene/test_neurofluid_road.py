@@ -88,6 +88,7 @@ def _run(method: str, scene: Path, out: Path, **settings: int) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_the_methods_of_table_s4_are_fitted_scored_and_stand_beside_it(
     watersphere: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

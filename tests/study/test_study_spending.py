@@ -53,6 +53,7 @@ def test_where_a_method_breaks_is_bisected(simulated: list[tuple[str, str, int]]
     assert len(simulated) == 9
 
 
+@pytest.mark.slow
 def test_without_time_the_recordings_as_they_are_remain(balls_directory: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["study", "stress", str(out), "--methods", GREY, "--scenes", str(balls_directory)]

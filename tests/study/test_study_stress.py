@@ -92,6 +92,7 @@ def test_what_makes_no_sense_is_one_line(
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_method_may_be_called_as_it_likes(balls_directory: Path, tmp_path: Path) -> None:
     odd = tmp_path / "odd.py"
     lines = ["import sys", f"sys.path.insert(0, {str(METHODS.parent)!r})", "from study_methods import Grey"]
