@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.files import require_plain_file
 from splashbench.prepare.audio.waveform import AudioTrack, join_audio
 from splashbench.prepare.video.chapters import check_chapters
 
@@ -62,6 +63,7 @@ class VideoInfo:
 @contextmanager
 def open_media(path: Path) -> Iterator[Any]:
     """An open PyAV container; whatever FFmpeg has against the file becomes one line that names it."""
+    require_plain_file(path)  # FFmpeg would wait for a pipe without end
     try:
         # "file:" keeps a name with a colon in it from being taken for a network address.
         with av.open(f"file:{path}", options={"format_whitelist": _FORMATS}) as container:

@@ -315,3 +315,11 @@ def test_a_gopro_file() -> None:
     truth = sequential(recording.paths[0])
     chosen = dict(recording.frames([0, 7, 200, 361]))
     assert all(np.array_equal(chosen[index], truth[index]) for index in (0, 7, 200, 361))
+
+
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mp4")
+    (tmp_path / "endless.mp4").symlink_to("/dev/zero")
+    for name in ("pipe.mp4", "endless.mp4"):
+        with pytest.raises(SplashbenchError, match=name.replace(".", r"\.")):
+            probe(tmp_path / name)
