@@ -6,6 +6,7 @@ what the release lacks; it is optional.
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any, Literal
@@ -124,7 +125,7 @@ class SceneMeta(BaseModel):
             _check_times("times", self.times)
         for camera, times in (self.camera_times or {}).items():
             _check_times(f"camera_times of camera {camera}", times)
-        if self.gravity is not None and not abs(float(np.linalg.norm(self.gravity)) - 1) <= 1e-3:
+        if self.gravity is not None and not abs(math.hypot(*self.gravity) - 1) <= 1e-3:
             raise ValueError("gravity must be a unit vector")
         if self.container_pose is not None:
             if [len(row) for row in self.container_pose] != [4] * 4:

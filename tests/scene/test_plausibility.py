@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from splashbench.scene import Camera, Scene, look_at
+from splashbench.scene import Camera, Scene, SceneMeta, look_at
 from splashbench.scene.inspection import check_scene
 
 
@@ -110,3 +111,8 @@ def test_what_is_no_plain_file_is_one_line_and_not_waited_for(name: str, balls_c
     else:
         os.mkfifo(balls_copy / name)
     assert any(name in fault for fault in check_scene(balls_copy))
+
+
+def test_a_gravity_that_overflows_is_no_unit_vector() -> None:
+    with pytest.raises(ValidationError, match="gravity"), np.errstate(all="raise"):
+        SceneMeta(name="a", times=[0.0, 1.0], gravity=(1e200, 1e200, 0.0))
