@@ -45,7 +45,7 @@ test: .venv/installed-test
 # Something of every folder of tests/, chosen by how long it takes; tests/test_quick.py holds it against the folders.
 QUICK := $(addprefix tests/test_, alignment.py architecture.py files.py manifest.py markdown.py public_names.py quick.py) \
   $(addprefix tests/, benchmark/test_estimate.py cli/test_arguments.py cli/test_help.py cluster/test_cluster_place.py container/test_container_released.py \
-  docs/test_commands.py docs/test_links.py docs/test_python_blocks.py download/test_fetch.py export/test_export_surface.py fuzz/test_fuzz_toml.py gaussians/test_ssim.py \
+  docs/test_commands.py docs/test_links.py docs/test_python_blocks.py download/test_fetch.py export/test_export_surface.py fuzz/test_fuzz_round_trips.py gaussians/test_ssim.py \
   harness/test_output_checks.py harness/test_runner_geometry.py harness/test_training_copy.py methods/test_renamed_settings.py \
   methods/test_scaffold_parts.py native/test_native_library.py observe/test_observe_fields.py prepare/test_gates.py \
   prepare/test_session.py render/test_render_parts.py replay/test_camera_paths.py report/test_report_leaderboard.py \

@@ -22,6 +22,8 @@ import time
 import traceback
 from pathlib import Path
 
+import fuzz_cases
+
 MAX_SECONDS, MAX_MEMORY_BYTES = 60, 6 << 30
 _BATCH = {"mesh": 1000, "submission": 200, "scene": 200}
 _LARGE_BATCH = 5000
@@ -29,9 +31,6 @@ _LARGE_BATCH = 5000
 
 def batch(kind: str, start: int, stop: int, progress: Path) -> int:
     """Carry out cases in this process; prints one JSON object. progress: a file that names the case under way."""
-    sys.path.insert(0, str(Path(__file__).parent))
-    import fuzz_cases
-
     findings, slowest = [], 0.0
     with tempfile.TemporaryDirectory() as folder:
         corpus = fuzz_cases.Corpus(Path(folder))
@@ -82,8 +81,7 @@ def run(kind: str, count: int, first: int, until: float) -> dict:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    kinds = ("toml", "json", "npz", "image", "mesh", "submission", "scene")
-    parser.add_argument("--kinds", nargs="+", choices=kinds, default=kinds)
+    parser.add_argument("--kinds", nargs="+", choices=[*fuzz_cases.CASES], default=[*fuzz_cases.CASES])
     parser.add_argument("--count", type=int, default=1000, help="cases of each kind")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--minutes", type=float, default=1e6, help="stop after so long")

@@ -25,11 +25,12 @@ import numpy as np
 from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import image_size, read_gray, read_image, read_json, read_npz, require_png
+from splashbench.files.png import png_of
 from splashbench.scene import Particles, Scene, SignedDistance
 from splashbench.scene.layout import SceneMeta
+from splashbench.score import Result
 from splashbench.submission import Identity, Record, seal, to_8bit, write_view
 
-KINDS = ("toml", "json", "npz", "image", "mesh", "submission", "scene")
 _TEXTS = (
     *("0", "-1", "1e308", "-1e308", "1e400", "NaN", "Infinity", "nan", "inf", "null", "true", '""', "[]", "{}"),
     *("9" * 400, "9" * 5000, '"\\ud800"', '"\\u0000"', '"\x7f"', "1979-05-27T07:32:00Z", "0x7fffffffffffffff"),
@@ -160,10 +161,7 @@ def mutated_png(rng: random.Random, content: bytes) -> bytes:
             chunks[0] = b"IHDR", struct.pack(">IIBBBBB", *stated)
         else:
             chunks[k] = kind, data + zlib.compress(bytes(100_000))
-    out = b"\x89PNG\r\n\x1a\n"
-    for kind, data in chunks:
-        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return out
+    return png_of(chunks)
 
 
 def mutated_glb(rng: random.Random, content: bytes) -> bytes:
@@ -236,7 +234,7 @@ def outcome(kind: str, number: int, corpus: Corpus) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            return _CASES[kind](rng, corpus)
+            return CASES[kind](rng, corpus)
     except SplashbenchError as error:
         return "" if str(error).isprintable() else f"not one line: {str(error)[:200]!r}"
 
@@ -292,7 +290,7 @@ def _image(rng: random.Random, corpus: Corpus) -> str:
 
 def _mesh(rng: random.Random, corpus: Corpus) -> str:
     from splashbench.scene.container import ContainerMesh
-    from splashbench.scene.mesh_process import _decoded
+    from splashbench.scene.mesh_process import decoded
 
     name = rng.choice(list(corpus.meshes))
     content = corpus.meshes[name]
@@ -302,7 +300,7 @@ def _mesh(rng: random.Random, corpus: Corpus) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            vertices, faces = _decoded(path, 2_000_000)
+            vertices, faces = decoded(path, 2_000_000)
     except Exception:
         return ""
     with contextlib.suppress(ValueError):
@@ -379,6 +377,8 @@ def _submission(rng: random.Random, corpus: Corpus) -> str:
         scored, told = _command("score", folder, "--scene", corpus.scene_folder, "--out", results)
         if status == 0 and scored != 0:
             return f"check passed what score refused: {told[-300:]!r}"
+        for path in results.glob("*.json"):
+            Result.load(path)  # what was scored is read again
     return ""
 
 
@@ -394,7 +394,8 @@ def _scene(rng: random.Random, corpus: Corpus) -> str:
     return ""
 
 
-_CASES: dict[str, Callable[[random.Random, Corpus], str]] = {
+#: Kind -> what reads a case of it, and says what is wrong with how that went.
+CASES: dict[str, Callable[[random.Random, Corpus], str]] = {
     "toml": _toml,
     "json": _json,
     "npz": _npz,

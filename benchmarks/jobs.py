@@ -31,6 +31,7 @@ import psutil
 
 from splashbench import toml
 from splashbench.files import write_json, write_text
+from splashbench.processes import marked_processes
 from splashbench.study.execution import ExecutionOptions, carry_out_plan
 from splashbench.study.job import Store
 from splashbench.study.plan import make_plan
@@ -150,10 +151,9 @@ class _ProcessorTime(threading.Thread):
     def run(self) -> None:
         while not self._ended.wait(1.0):
             total = _of(self._own)
-            for process in psutil.process_iter():
-                with contextlib.suppress(psutil.Error, OSError):
-                    if process.environ().get(_MARK) == self._mark:
-                        total += _of(process)
+            for process in marked_processes(_MARK, self._mark):
+                with contextlib.suppress(psutil.Error):
+                    total += _of(process)
             self._most = max(self._most, total)
 
     def stop(self) -> float:

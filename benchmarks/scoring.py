@@ -25,9 +25,9 @@ import torch
 from splashbench.cli.arguments import image_size
 from splashbench.files import write_json
 from splashbench.harness import hardware
-from splashbench.score.image import lpips as lpips_module
-from splashbench.score.image import weights as weights_module
 from splashbench.score.image.fidelity import outside_filled, psnr, ssim
+from splashbench.score.image.lpips import CONVOLUTIONS, SCALE, SHIFT, Lpips
+from splashbench.score.image.weights import weights_digest
 
 AGREEMENT = 1e-5
 SIGMA = 1.5
@@ -93,14 +93,14 @@ def made_weights() -> dict[str, np.ndarray]:
 def lpips_by_modules(weights: dict[str, np.ndarray]) -> Callable[[np.ndarray, np.ndarray], float]:
     """LPIPS as its authors' package computes it: torch.nn's modules, both images one after the other."""
     layers: list[torch.nn.Module] = []
-    for i, (stride, padding, pooled) in enumerate(lpips_module._CONVOLUTIONS, 1):
+    for i, (stride, padding, pooled) in enumerate(CONVOLUTIONS, 1):
         weight, bias = (torch.from_numpy(weights[f"conv{i}.{part}"]) for part in ("weight", "bias"))
         convolution = torch.nn.Conv2d(weight.shape[1], weight.shape[0], weight.shape[2], stride, padding)
         convolution.load_state_dict({"weight": weight, "bias": bias})
         layers.append(
             torch.nn.Sequential(*([torch.nn.MaxPool2d(3, 2)] if pooled else []), convolution, torch.nn.ReLU())
         )
-    shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (lpips_module._SHIFT, lpips_module._SCALE))
+    shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (SHIFT, SCALE))
 
     @torch.no_grad()
     def features(image: np.ndarray) -> list[torch.Tensor]:
@@ -124,8 +124,7 @@ def lpips_by_modules(weights: dict[str, np.ndarray]) -> Callable[[np.ndarray, np
 def lpips_rows(pair: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Callable[[], tuple[float, ...]]]:
     """LPIPS of the masked images, ours and by modules."""
     weights = made_weights()
-    lpips_module.WEIGHTS_SHA256 = weights_module.weights_digest(weights)  # type: ignore[misc]
-    metric, modules = lpips_module.Lpips(weights), lpips_by_modules(weights)
+    metric, modules = Lpips(weights, weights_digest(weights)), lpips_by_modules(weights)
     render, truth, mask = pair
     first, second = (np.where(mask[..., None], image / 255, 0.0) for image in (render, truth))
     return {

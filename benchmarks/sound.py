@@ -368,7 +368,7 @@ def run(trial: tuple[str, int], seed: int, real: Path | None) -> Outcome:
     failed = ", ".join(gate.name for gate in sync_gates(fits, None) if not gate.passed)
     error = float("inf") if made.clock is None else clock_error(fit, made)
     drift, clock = None, None
-    if made.clock is not None and hasattr(fit, "drift_interval"):
+    if made.clock is not None:
         drift = abs(fit.clock_rate - made.clock[1]) <= fit.drift_interval
         clock = error <= fit.interval_s
     if failed:

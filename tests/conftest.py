@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
@@ -39,6 +41,20 @@ def balls(balls_directory: Path) -> Scene:
 def balls_copy(balls_directory: Path, tmp_path: Path) -> Path:
     """A copy of the scene that the test may damage."""
     return Path(shutil.copytree(balls_directory, tmp_path / "balls"))
+
+
+@pytest.fixture
+def no_hang() -> Iterator[None]:
+    """Ends a test after a minute: opening a pipe that nobody writes to waits for ever."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError("this hangs")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(scope="session")

@@ -24,7 +24,7 @@ from splashbench.files import (
     write_image,
     write_png,
 )
-from splashbench.files.png import png_header, require_pixels
+from splashbench.files.png import png_header, png_of, require_pixels
 
 NOISE = np.random.default_rng(0).integers(0, 255, (40, 30, 3), dtype=np.uint8)
 
@@ -187,10 +187,7 @@ def test_pixels_that_cannot_be_unpacked_are_found_when_asked_for(tmp_path: Path,
     """Forged: every checksum holds."""
     parts = [(b"IHDR", struct.pack(">IIBBBBB", 40, 40, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(pixels) + bytes(100))]
     parts.append((b"IEND", b""))
-    content = b"\x89PNG\r\n\x1a\n"
-    for kind, data in parts:
-        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    (path := tmp_path / "image.png").write_bytes(content)
+    (path := tmp_path / "image.png").write_bytes(png_of(parts))
     require_png(path, "RGB")
     with pytest.raises(SplashbenchError, match="is not a readable PNG"):
         require_png(path, "RGB", pixels=True)
@@ -208,13 +205,26 @@ def test_an_honest_png_has_the_bytes_it_should(size: tuple[int, int], is_interla
         columns = len(range(x, width, step_x))
         rows += len(range(y, height, step_y)) * (1 + 3 * columns) if columns else 0
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, int(is_interlaced))
-    content = b"\x89PNG\r\n\x1a\n"
-    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(rows))), (b"IEND", b"")):
-        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    content = png_of([(b"IHDR", header), (b"IDAT", zlib.compress(bytes(rows))), (b"IEND", b"")])
     stated = png_header(content)
     assert stated.n_bytes == rows
     require_pixels(stated)
     assert Image.open(io.BytesIO(content)).convert("RGB").size == size
+
+
+@pytest.mark.parametrize("is_interlaced", [False, True])
+def test_a_filter_that_there_is_not_is_found_in_every_row(is_interlaced: bool, tmp_path: Path) -> None:
+    header = struct.pack(">IIBBBBB", 8, 8, 8, 2, 0, 0, int(is_interlaced))
+    passes = png_header(png_of([(b"IHDR", header), (b"IDAT", bytes(9)), (b"IEND", b"")])).passes
+    starts = [row_bytes for rows, row_bytes in passes for _ in range(rows)]
+    for place in [0, *np.cumsum(starts)[:-1].tolist()]:
+        pixels = bytearray(sum(starts))
+        pixels[place] = 9
+        path = tmp_path / "image.png"
+        path.write_bytes(png_of([(b"IHDR", header), (b"IDAT", zlib.compress(bytes(pixels))), (b"IEND", b"")]))
+        for read in (lambda path: require_png(path, "RGB", pixels=True), lambda path: read_png(path, "RGB")):
+            with pytest.raises(SplashbenchError, match=r"image\.png is"):
+                read(path)
 
 
 def test_parts_that_say_nothing_of_pixels_do_not_matter(tmp_path: Path) -> None:

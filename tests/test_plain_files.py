@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 import pytest
 
@@ -16,19 +14,7 @@ from splashbench.files import image_size, read_gray, read_image, read_json, read
 from splashbench.files.contents import list_files
 from splashbench.files.ply import read_point_cloud
 
-
-@pytest.fixture(autouse=True)
-def _no_hang() -> Iterator[None]:
-    """Opening a pipe that nobody writes to waits for ever."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise TimeoutError("this hangs")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(20)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
+pytestmark = pytest.mark.usefixtures("no_hang")
 
 
 def sparse(path: Path) -> None:

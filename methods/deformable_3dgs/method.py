@@ -9,13 +9,13 @@ import numpy as np
 
 from splashbench.files import read_npz
 from splashbench.gaussians.density_control import DensityControl
-from splashbench.gaussians.devices import device_fault
+from splashbench.gaussians.devices import GaussianMethod
 from splashbench.gaussians.fitting import fit_dynamic
 from splashbench.gaussians.initialization import camera_extent, initialization
 from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
 from splashbench.gaussians.optimizer import LearningRate, RowOptimizer
 from splashbench.gaussians.photographs import Photographs
-from splashbench.harness.contract import Method, MethodConfig, Run
+from splashbench.harness.contract import MethodConfig, Run
 from splashbench.scene import TrainingScene
 
 from .model import ROWS, DeformableModel
@@ -52,14 +52,13 @@ def rates(settings: DeformableSettings, extent: float) -> dict[str, LearningRate
     return {name: rate.short() for name, rate in published.items()}
 
 
-class Deformable3DGS(Method):
+class Deformable3DGS(GaussianMethod):
     """Canonical Gaussians and a deformation network; background and liquid are one set."""
 
     id: ClassVar[str] = "deformable_3dgs"
     title: ClassVar[str] = "Deformable-3DGS"
     version: ClassVar[str] = "4"  # since the times' noise of `paper` is the official code's
     Config: ClassVar[type[MethodConfig]] = DeformableSettings
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     mixed: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: DeformableSettings, run: Run) -> MixedFitted:
@@ -97,9 +96,6 @@ class Deformable3DGS(Method):
                 )
         model.deforms, model.active_degree = True, config.sh_degree
         return MixedFitted(model, scene, history)
-
-    def device_fault(self, device: str) -> str | None:
-        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         path = directory / MODEL_FILE

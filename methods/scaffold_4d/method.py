@@ -7,13 +7,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from splashbench.gaussians.devices import device_fault
+from splashbench.gaussians.devices import GaussianMethod
 from splashbench.gaussians.fitting import fit_dynamic
 from splashbench.gaussians.initialization import camera_extent, initialization
 from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
 from splashbench.gaussians.optimizer import LearningRate
 from splashbench.gaussians.photographs import Photographs, unit_time
-from splashbench.harness.contract import Method, MethodConfig, Run
+from splashbench.harness.contract import MethodConfig, Run
 from splashbench.scene import TrainingScene
 
 from ..scaffold_gs.model import PER_ANCHOR
@@ -33,14 +33,13 @@ def rates(settings: Scaffold4DSettings) -> dict[str, LearningRate]:
     return published if settings.rates == "published" else {name: rate.short() for name, rate in published.items()}
 
 
-class Scaffold4D(Method):
+class Scaffold4D(GaussianMethod):
     """Anchors in space-time, decoded into moving Gaussians; background and liquid are one set."""
 
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
     version: ClassVar[str] = "3"  # since it starts and penalises volumes as published
     Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     mixed: ClassVar[bool] = True
 
     def fit(self, scene: TrainingScene, config: Scaffold4DSettings, run: Run) -> MixedFitted:
@@ -71,9 +70,6 @@ class Scaffold4D(Method):
                     after_step=lambda: run.checkpoint(lambda: MixedFitted(model, scene)),
                 )
         return MixedFitted(model, scene, history)
-
-    def device_fault(self, device: str) -> str | None:
-        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         path = directory / MODEL_FILE

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.gaussians.devices import device_fault
-from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
+from splashbench.gaussians.devices import GaussianMethod
+from splashbench.harness.contract import Fitted, MethodConfig, Render, Run
 from splashbench.scene import Camera, Gaussians, Particles, TrainingScene
 
 from .background import Background
@@ -40,23 +40,19 @@ class StaticScene(Fitted):
         self.background.save(directory / "static")
 
 
-class ScaffoldGS(Method):
+class ScaffoldGS(GaussianMethod):
     """Static anchors fitted to the liquid-free plates (Lu et al., CVPR 2024)."""
 
     id: ClassVar[str] = "scaffold_gs"
     title: ClassVar[str] = "Scaffold-GS, static"
     version: ClassVar[str] = "2"  # since backgrounds are stored in whole steps
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")  # the fit; the renders are the CPU's
 
     def fit(self, scene: TrainingScene, config: BackgroundSettings, run: Run) -> Fitted:
         def offer(state: Callable[[], Background]) -> None:
             run.checkpoint(lambda: StaticScene(state()))
 
         return StaticScene(shared_background(scene, config, run, offer=offer))
-
-    def device_fault(self, device: str) -> str | None:
-        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> Fitted:
         return StaticScene(Background.load(directory / "static"))

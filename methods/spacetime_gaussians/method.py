@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from splashbench.gaussians.density_control import DensityControl
-from splashbench.gaussians.devices import device_fault
+from splashbench.gaussians.devices import GaussianMethod
 from splashbench.gaussians.fitting import fit_dynamic
 from splashbench.gaussians.initialization import camera_extent, initialization
 from splashbench.gaussians.mixed_model import MODEL_FILE, MixedFitted, load_tables
 from splashbench.gaussians.optimizer import LearningRate, RowOptimizer
 from splashbench.gaussians.photographs import Photographs, unit_time
-from splashbench.harness.contract import Method, MethodConfig, Run
+from splashbench.harness.contract import MethodConfig, Run
 from splashbench.scene import TrainingScene
 
 from .guided import GuidedDensity
@@ -50,14 +50,13 @@ def rates(settings: SpacetimeSettings, extent: float, full: bool) -> dict[str, L
     return {name: rate.short() for name, rate in published.items()}
 
 
-class SpacetimeGaussians(Method):
+class SpacetimeGaussians(GaussianMethod):
     """Gaussians that fade in and out and move on polynomials; background and liquid are one set."""
 
     id: ClassVar[str] = "spacetime_gaussians"
     title: ClassVar[str] = "SpacetimeGaussians, full"
     version: ClassVar[str] = "3"  # since `quick` starts with faint Gaussians, as published
     Config: ClassVar[type[MethodConfig]] = SpacetimeSettings
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     mixed: ClassVar[bool] = True
     full: ClassVar[bool] = True
 
@@ -81,9 +80,6 @@ class SpacetimeGaussians(Method):
                     after_step=lambda: run.checkpoint(lambda: MixedFitted(model, scene)),
                 )
         return MixedFitted(model, scene, history)
-
-    def device_fault(self, device: str) -> str | None:
-        return device_fault(device)
 
     def load(self, directory: Path, scene: TrainingScene) -> MixedFitted:
         model = SpacetimeModel(0, self.full)

@@ -137,9 +137,9 @@ class SplashSplatConfig(MethodConfig):
     coverage_reach: float = Field(4.0, ge=0)
     #: carriers that a cell is filled up to, at the least
     min_per_cell: PositiveInt = 2
-    #: and at the most, near the surface and where it is curved
+    #: carriers that a cell near the surface is filled up to, at the most, where it is curved
     max_per_cell: PositiveInt = 6
-    #: of cells deeper than 3 voxels; None for as many as elsewhere
+    #: carriers that a cell deeper than 3 voxels is filled up to; None for as many as elsewhere
     interior_per_cell: PositiveInt | None = 1
     #: no carriers where no training view can see them
     visible_only: bool = True
@@ -163,13 +163,13 @@ class SplashSplatConfig(MethodConfig):
     # Optimisation
     #: steps of the appearance's fit, at most
     iterations: int = Field(4000, ge=0)
-    #: of carriers' own features
+    #: learning rate of carriers' own features
     learning_rate_features: PositiveFloat = 0.06
-    #: of the features that carriers of a cell share
+    #: learning rate of the features that carriers of a cell share
     learning_rate_cells: PositiveFloat = 0.02
-    #: of the decoder's heads
+    #: learning rate of the decoder's heads
     learning_rate_heads: PositiveFloat = 0.015
-    #: of carriers' sizes
+    #: learning rate of carriers' sizes
     learning_rate_scales: PositiveFloat = 1e-2
     #: carriers born in one cell share a part of their features: its size in voxels and in frames, for each part
     feature_cells: tuple[PositiveFloat, ...] = Field((4.0, 16.0), max_length=6)
@@ -206,7 +206,7 @@ class SplashSplatConfig(MethodConfig):
     separation_weight: float = Field(0.1, ge=0)
     #: weight of the loss: colours of a cell's carriers apart from their mean
     color_weight: float = Field(1.0, ge=0)
-    #: of what photographs show beside the liquid, where there is `glass`
+    #: weight of the loss: what photographs show beside the liquid, where there is `glass`
     beside_weight: float = Field(0.4, ge=0)
     #: Gaussians of a transparent container before the liquid, to begin with, where images have 240 pixels along the
     #: longer side; more in proportion where they have more; 0 for none

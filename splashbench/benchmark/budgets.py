@@ -16,7 +16,7 @@ from splashbench.harness.contract import Method
 from splashbench.harness.discovery import load_method
 from splashbench.study.plan import StudyPlan, make_plan
 from splashbench.study.spec import Paper, Reference, SceneEntry, StudySpec, StudyVariant
-from splashbench.study.stress import method_labels, parse_method
+from splashbench.study.stress import NOTHING, method_labels, parse_method
 
 Budget = Literal["quick", "full"]
 #: Six methods: the paper's, its three baselines, the hull's points, and the nearest photograph as a yardstick.
@@ -26,10 +26,8 @@ DEFAULT_METHODS = (
 #: The setting that says to how many pixels photographs are shrunk, and a value that shrinks none.
 SHRINKS, NATIVE_SIDE = "longest_side", 16384
 #: The preset of a full budget where it is not a method's first one: the published schedules.
-_FULL = {
-    **dict.fromkeys(("deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d"), "paper"),
-}
-#: On top of the preset of the control `nothing`.
+_FULL = dict.fromkeys(("deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d"), "paper")
+#: On top of the preset of the control `nothing`; tests shorten it.
 REFERENCE_SETTINGS: dict[str, Any] = {}
 _METRICS = (
     *("psnr", "dpsnr_bg", "ssim", "lpips", "miou", "spill", "jitter_error", "sigma_d", "sigma_mu_ratio", "uniformity"),
@@ -84,7 +82,7 @@ def make_benchmark_plan(
     timeout_seconds: float | None = None,
 ) -> StudyPlan:
     """The runs of `entrants` on `scenes`, and of the control `nothing` on each."""
-    nothing = load_method("nothing")
+    nothing = load_method(NOTHING)
     settings = {SHRINKS: NATIVE_SIDE} if SHRINKS in nothing.Config.model_fields else {}
     settings |= REFERENCE_SETTINGS
     paper_names = set(DEFAULT_METHODS[:4])

@@ -1,17 +1,16 @@
 """How long a benchmark takes, and how much memory and disk, before it starts.
 
-Three sources, the best one first: runs of the method that were made in the same folder; whole fits recorded in
-rates.json, between and beyond their sizes by straight lines, and scaled to this machine by a render of a second; and
-nothing, which is said. An estimate is for the whole of it, and no better than a factor of two.
+Three sources, the best one first: runs of the method that were made in the same folder; fits recorded in rates.json,
+between and beyond their sizes by straight lines, and scaled to this machine by a render of a second; and nothing, which
+is said. harness/estimates.py is no source: it knows fits of the same size alone, and none of a study's.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from itertools import pairwise
 from statistics import fmean
@@ -25,6 +24,7 @@ from splashbench.render import rasterize_arrays
 from splashbench.scene import Camera, Scene
 from splashbench.study.job import Store
 from splashbench.study.plan import PlannedRun, StudyPlan
+from splashbench.study.stress import NOTHING
 
 _PROBE_GAUSSIANS, _PROBE_SIZE, _PROBE_SECONDS = 20_000, (640, 416), 0.7
 # Of a third core and every further one: fits are not spread over them evenly.
@@ -37,17 +37,17 @@ class _Strict(BaseModel):
 
 
 class Recorded(_Strict):
-    """Whole fits of a method and preset. points: (megapixels of a photograph, seconds) in rising order.
+    """Fits of a method and preset, which `source` says the origin of. points: (megapixels of a photograph, seconds) in
+    rising order.
 
     grows_with: what a fit takes longer with, the "iterations" or the "timesteps", of which the points had `amount`.
-    memory_bytes, storage_bytes: of points of memory, and of a model. cache_bytes: kept in the folder for each scene.
+    memory_points: (megapixels, bytes of memory). cache_bytes: kept in the folder for each scene.
     """
 
     points: list[tuple[float, float]]
     grows_with: str
     amount: int
     memory_points: list[tuple[float, float]]
-    storage_bytes: float
     cache_bytes: float = 0.0
     source: str
 
@@ -131,15 +131,27 @@ class MethodEstimate:
 
 @dataclass
 class Estimate:
-    """What a plan takes. seconds: of all known runs that are left, one after another; disk_bytes: in the folder."""
+    """What a plan takes. disk_bytes: in the folder."""
 
     methods: list[MethodEstimate]
     scenes: int
-    seconds: float
-    memory_bytes: float
     disk_bytes: float
     machine: Machine
-    unknown: list[str] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> float:
+        """Of all known runs that are left, one after another."""
+        return sum(each.seconds or 0.0 for each in self.methods)
+
+    @property
+    def memory_bytes(self) -> float:
+        """The most that a known run takes."""
+        return max((each.memory_bytes for each in self.methods), default=0.0)
+
+    @property
+    def unknown(self) -> list[str]:
+        """Methods of which nothing is known."""
+        return [each.label for each in self.methods if each.seconds is None]
 
     @property
     def left(self) -> int:
@@ -153,22 +165,8 @@ def estimate(plan: StudyPlan, store: Store, rates: Rates, machine: Machine, with
     rows: dict[str, list[PlannedRun]] = {}
     for run in (*plan.reference_row, *plan.runs):
         rows.setdefault(run.variant.name, []).append(run)
-    methods, disk, unknown = [], 0.0, []
-    for name, runs in rows.items():
-        row, row_disk = _row(name, runs, sizes, store, rates, machine, with_lpips)
-        methods.append(row)
-        disk += row_disk
-        if row.seconds is None:
-            unknown.append(name)
-    return Estimate(
-        methods=methods,
-        scenes=len(plan.scenes),
-        seconds=sum(each.seconds or 0.0 for each in methods),
-        memory_bytes=max((each.memory_bytes for each in methods), default=0.0),
-        disk_bytes=disk,
-        machine=machine,
-        unknown=unknown,
-    )
+    found = [_row(name, runs, sizes, store, rates, machine, with_lpips) for name, runs in rows.items()]
+    return Estimate([row for row, _ in found], len(plan.scenes), sum(disk for _, disk in found), machine)
 
 
 @dataclass(frozen=True)
@@ -234,7 +232,7 @@ def _row(
         row.basis = f"{len(per_work)} of its runs, made here"
     else:
         row.seconds, row.basis = None, "nothing: no run of it was recorded, and none was made here yet"
-    if first.variant.name == "nothing":  # references stay: others are measured against their renders
+    if first.method == NOTHING:  # references stay: others are measured against their renders
         disk += sum(sizes[run.scene.name].test for run in runs) * rates.picture_bytes
     return row, disk
 
@@ -262,18 +260,14 @@ def _line(points: Sequence[tuple[float, float]], x: float) -> float:
 
 def as_json(found: Estimate) -> dict:
     """The estimate for programs."""
-    return json.loads(
-        json.dumps(
-            {
-                "scenes": found.scenes,
-                "runs_left": found.left,
-                "seconds": found.seconds,
-                "memory_bytes": found.memory_bytes,
-                "disk_bytes": found.disk_bytes,
-                "machine_factor": found.machine.factor,
-                "cores": found.machine.cores,
-                "unknown": found.unknown,
-                "methods": [vars(each) for each in found.methods],
-            }
-        )
-    )
+    return {
+        "scenes": found.scenes,
+        "runs_left": found.left,
+        "seconds": found.seconds,
+        "memory_bytes": found.memory_bytes,
+        "disk_bytes": found.disk_bytes,
+        "machine_factor": found.machine.factor,
+        "cores": found.machine.cores,
+        "unknown": found.unknown,
+        "methods": [asdict(each) for each in found.methods],
+    }

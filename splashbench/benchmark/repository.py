@@ -8,7 +8,7 @@ are not followed, and every file is read within limits.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -107,18 +107,30 @@ def read_entries(folder: Path, benchmark: Benchmark, with_scenes: bool = False) 
     place = Path(folder, ENTRIES)
     if not place.is_dir():
         raise SplashbenchError(f"{place} is missing; a benchmark keeps there what is handed in, a folder for each")
-    names = sorted(path.name for path in place.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if place.is_symlink():
+        raise SplashbenchError(f"{place} is a link; make it a folder")
+    names = sorted(path.name for path in place.iterdir() if _is_handed_in(path))
     if len(names) > MAX_ENTRIES:
         raise SplashbenchError(f"{place} has {len(names)} entries, more than {MAX_ENTRIES}; split the benchmark")
     entries = [_read_entry(place / name, benchmark, with_scenes) for name in names]
-    _find_repeats(entries)
+    find_repeats(entries)
     return entries
+
+
+def _is_handed_in(path: Path) -> bool:
+    """Whether `path` is a folder, or a link or file that somebody takes for an entry; notes beside them are neither."""
+    if path.name.startswith("."):
+        return False
+    return path.is_dir() or path.is_symlink() or path.suffix in (".json", ".toml")
 
 
 def _read_entry(folder: Path, benchmark: Benchmark, with_scenes: bool) -> Entry:
     entry = Entry(folder.name, folder)
     if folder.is_symlink():
         entry.faults.append(f"{folder} is a link; hand in the files themselves")
+        return entry
+    if not folder.is_dir():
+        entry.faults.append(f"{folder} is no folder; make one for the entry, and move the file into it")
         return entry
     if not _NAME.fullmatch(folder.name):
         entry.faults.append(
@@ -137,6 +149,7 @@ def _read_entry(folder: Path, benchmark: Benchmark, with_scenes: bool) -> Entry:
         entry.faults.append(
             f"{folder} has {listing.bytes >> 20} MiB, more than {MAX_BYTES >> 20}; publish renders elsewhere"
         )
+        return entry
     places = (name.rpartition("/") for name in listing.names)
     entry.submissions = sorted(place for place, _, name in places if name == "submission.toml")
     for name in listing.names:
@@ -183,7 +196,7 @@ def result_fault(result: Result, benchmark: Benchmark) -> str:
     return ""
 
 
-def _find_repeats(entries: Sequence[Entry]) -> None:
+def find_repeats(entries: Sequence[Entry]) -> None:
     """A run may be handed in once: two entries with one method, settings, scene and seed would push each other out."""
     first: dict[tuple[str, ...], str] = {}
     for entry in entries:
@@ -210,15 +223,21 @@ def init_benchmark(folder: Path, title: str, scenes: Sequence[Scene] = ()) -> li
     folder = Path(folder)
     if folder.is_dir() and any(path.name != ".git" for path in folder.iterdir()):
         raise SplashbenchError(f"{folder} holds files; give a new folder, or an empty git repository")
-    values = {"title": title, "about": "", "paper": "" if scenes else "real_20"}
+    title = one_line(title)
     tables = [{"name": scene.name, "digest": scene.digest} for scene in scenes]
     tables = tables or [{"name": name} for name in load_scenes()]
-    text = toml.dumps({"schema_version": 1, **values, "scenes": tables})
+    values = {"schema_version": 1, "title": title, "about": "", "paper": "" if scenes else "real_20", "scenes": tables}
+    validate_model(folder / BENCHMARK_FILE, Benchmark, values)
+    text = toml.dumps(values)
     template = files("splashbench.benchmark").joinpath("template")
+    readme, workflow = (
+        template.joinpath(name).read_text(encoding="utf-8").replace("@VERSION@", __version__)
+        for name in ("README.md", "workflow.yml")
+    )
     contents = {
         BENCHMARK_FILE: text,
-        "README.md": template.joinpath("README.md").read_text(encoding="utf-8").replace("@TITLE@", title),
-        WORKFLOW: template.joinpath("workflow.yml").read_text(encoding="utf-8").replace("@VERSION@", __version__),
+        "README.md": readme.replace("@TITLE@", title),
+        WORKFLOW: workflow,
         f"{ENTRIES}/.gitkeep": "",
         ".gitignore": "/site/\n",
     }
@@ -230,8 +249,3 @@ def init_benchmark(folder: Path, title: str, scenes: Sequence[Scene] = ()) -> li
             for name, content in contents.items():
                 write_text(staging / name, content)
     return [folder / name for name in contents]
-
-
-def shown(entries: Sequence[Entry]) -> Iterator[Entry]:
-    """Those without a fault."""
-    return (entry for entry in entries if not entry.faults)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +26,8 @@ def find_scenes(places: Sequence[str]) -> list[Path]:
     found: list[Path] = []
     for place in places:
         found += _all_released() if place == ALL else _in_place(Path(place))
-    unique = list(dict.fromkeys(found))
+    # One folder may be named in two ways; a link is a scene of its own.
+    unique = list({os.path.normpath(path.absolute()): path for path in found}.values())
     if len(unique) > _MAX_SCENES:
         raise SplashbenchError(f"{len(unique)} scenes are more than {_MAX_SCENES}; name fewer folders with --scenes")
     return unique

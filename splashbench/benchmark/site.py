@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from splashbench.benchmark.repository import Benchmark, Entry
+from splashbench.benchmark.repository import ENTRIES, Benchmark, Entry
 from splashbench.csv_cells import csv_text
 from splashbench.errors import one_line
 from splashbench.pages import render
@@ -46,7 +46,9 @@ class Line:
 
 def entry_lines(benchmark: Benchmark, entries: Sequence[Entry], leaderboard_csv: str) -> list[Line]:
     """A line for every method, preset and settings of every entry: complete ones first, by LPIPS, then PSNR."""
-    rows = list(csv.DictReader(io.StringIO(leaderboard_csv)))
+    rows: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in csv.DictReader(io.StringIO(leaderboard_csv)):
+        rows.setdefault((row["method"], row["preset"], row["settings_digest"], row["hardware"]), []).append(row)
     lines = []
     for entry in entries:
         groups: dict[tuple[str, str, str, str], list[Result]] = {}
@@ -54,11 +56,7 @@ def entry_lines(benchmark: Benchmark, entries: Sequence[Entry], leaderboard_csv:
             key = (result.method, result.preset, result.settings_digest, result.hardware_label)
             groups.setdefault(key, []).append(result)
         for key, results in sorted(groups.items()):
-            cells = tuple(map(csv_text, key))
-            mine = [
-                row for row in rows if (row["method"], row["preset"], row["settings_digest"], row["hardware"]) == cells
-            ]
-            lines.append(_line(benchmark, entry, results, mine))
+            lines.append(_line(benchmark, entry, results, rows.get(tuple(map(csv_text, key)), [])))
     return sorted(lines, key=_rank)
 
 
@@ -132,12 +130,17 @@ def front_page(benchmark: Benchmark, lines: Sequence[Line], left_out: Sequence[E
         left_out=[
             {"name": entry.name, "fault": one_line(fault)[:_MAX_LINE]}
             for entry in left_out
-            for fault in entry.faults[:3]
+            for fault in _faults(entry)[:3]
         ][:_MAX_FAULTS],
         scenes=[scene.name for scene in benchmark.scenes],
         readable=readable,
         version=__version__,
     )
+
+
+def _faults(entry: Entry) -> list[str]:
+    """Its faults with places in the repository: where that lies on the machine that makes the page is nobody's."""
+    return [fault.replace(str(entry.folder.parent), ENTRIES) for fault in entry.faults]
 
 
 def _cell(name: str, value: float | None) -> str:
@@ -169,5 +172,5 @@ def site_facts(benchmark: Benchmark, lines: Sequence[Line], left_out: Sequence[E
             }
             for line in lines
         ],
-        "left_out": {entry.name: entry.faults for entry in left_out},
+        "left_out": {entry.name: _faults(entry) for entry in left_out},
     }

@@ -156,14 +156,37 @@ def add_lpips_weights(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) -> None:
-    """Add how the runs of a study are made. lost: what a run that takes too long has not; first: which come first."""
+def add_study_out(parser: argparse._ActionsContainer, noun: str = "study") -> None:
+    """Add the positional OUT of a `noun` of many runs."""
+    parser.add_argument("out", type=Path, metavar="OUT", help=f"folder of the {noun}; finished runs in it are reused")
+
+
+def add_methods(parser: argparse._ActionsContainer, help: str, required: bool = False) -> None:
+    """Add `--methods METHOD[:PRESET][:KEY=VALUE,...] ...`, empty where it is not given."""
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        action="extend",
+        default=[],
+        required=required,
+        metavar="METHOD[:PRESET][:KEY=VALUE,...]",
+        help=f"names of methods, or FILE.py:CLASS{help}",
+    )
+
+
+def add_run_timeout(parser: argparse._ActionsContainer, lost: str) -> None:
+    """Add `--timeout MINUTES` of the runs of a study. lost: what becomes of a run that takes longer."""
     parser.add_argument(
         "--timeout",
         type=positive_number("minutes"),
         metavar="MINUTES",
         help=f"for each fit, and again for each rendering; a run that takes longer {lost}",
     )
+
+
+def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) -> None:
+    """Add how the runs of a study are made. lost: what a run that takes too long has not; first: which come first."""
+    add_run_timeout(parser, lost)
     parser.add_argument(
         "--budget",
         type=positive_number("minutes"),

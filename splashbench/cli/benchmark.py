@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splashbench.cli import benchmark_site
-from splashbench.cli.arguments import add_lpips_weights, add_seeds, positive_number
+from splashbench.cli.arguments import add_lpips_weights, add_methods, add_run_timeout, add_seeds, add_study_out
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say
 from splashbench.cli.study_machines import add_machines, machine_options
@@ -58,7 +57,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         description="Estimate the time, run and score methods on scenes, make the leaderboard.",
         epilog=_RUN_EPILOG,
     )
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the benchmark; finished runs in it are reused")
+    add_study_out(parser, "benchmark")
     parser.add_argument(
         "--scenes",
         nargs="+",
@@ -67,26 +66,13 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         metavar="DIR",
         help="scenes, folders of some, or `all` for the 20 released ones",
     )
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="METHOD[:PRESET][:KEY=VALUE,...]",
-        help="names of methods, or FILE.py:CLASS (default: splashsplat, the three baselines, hull_points and "
-        "nearest_camera)",
-    )
+    add_methods(parser, " (default: splashsplat, the three baselines, hull_points and nearest_camera)")
     parser.add_argument(
         "--budget", choices=("quick", "full"), default="quick", help="presets of the methods (default: quick)"
     )
     parser.add_argument("--dry-run", action="store_true", help="print the estimate, and make nothing")
     add_seeds(parser, "of every method (default: 0)")
-    parser.add_argument(
-        "--timeout",
-        type=positive_number("minutes"),
-        metavar="MINUTES",
-        help="for each fit, and again for each rendering; a run that takes longer has failed",
-    )
+    add_run_timeout(parser, "has failed")
     parser.add_argument("--retry", action="store_true", help="repeat failed runs")
     parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
     parser.add_argument(
@@ -159,16 +145,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _remove_leftovers(out: Path) -> None:
     """Remove what an earlier process left that was killed while it wrote tables, charts or the leaderboard."""
+    from splashbench.files import remove_any
+
     for path in (*out.glob(".tmp-*"), *(out / "leaderboard").glob(".tmp-*")):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        remove_any(path)
 
 
 def _report(plan: StudyPlan, store: Store, arguments: argparse.Namespace) -> tuple[int, list[Path]]:
     """Write the tables and the leaderboard; returns how many runs failed, and the files."""
-    from splashbench.cli.main import build_parser
+    from splashbench.cli.main import run_within
     from splashbench.errors import SplashbenchError
     from splashbench.study.report import write_report
     from splashbench.study.table import make_table
@@ -178,17 +163,14 @@ def _report(plan: StudyPlan, store: Store, arguments: argparse.Namespace) -> tup
     board = arguments.out / "leaderboard"
     if not any(store.results.glob("*.json")):
         raise SplashbenchError(f"no run of {arguments.out} has a result; see the lines above, and {files[0]}")
-    words = ["leaderboard", str(store.results), str(board), "--with-paper"]
-    parsed = build_parser().parse_args(words)
-    status = parsed.handler(parsed)
-    if status:
+    if run_within(["leaderboard", str(store.results), str(board), "--with-paper"]):
         raise SplashbenchError(f"the leaderboard of {store.results} was not made; see the lines above")
     return len(means.failed), [*files, board / "index.html"]
 
 
 def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> None:
     """The estimate for people: one line, then what it rests on, method by method."""
-    from splashbench.study.execution import duration
+    from splashbench.harness.estimates import duration
 
     seconds = found.seconds / jobs
     unknown = f", and {', '.join(found.unknown)}, of which nothing is known" if found.unknown else ""
@@ -212,10 +194,10 @@ def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> N
         say("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0])).rstrip())
     say(
         f"This rests on the lines above, times {found.machine.factor:.2f} for this machine ({found.machine.cores} "
-        "cores), by a render. It may be twice as long, or half; with every run that is made it gets better."
+        "cores), by a render. Expect it to be off by a factor of two; with every run that is made it gets better."
     )
     if device != "cpu":
-        say("The estimate is for the processor: an H100 fitted the baselines in a sixth of the time (docs/gpu.md)")
+        say("The estimate is for the processor: at 600x400 an H100 took a sixth of the time (docs/gpu.md)")
     native = [each.label for each in entrants if each.native]
     if native:
         say(f"Photographs at the size they have (longest_side=16384): {', '.join(native)}")
@@ -228,7 +210,7 @@ def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> N
 
 
 def _long(seconds: float) -> str:
-    from splashbench.study.execution import duration
+    from splashbench.harness.estimates import duration
 
     if seconds < 48 * 3600:
         return duration(seconds)

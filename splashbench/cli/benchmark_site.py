@@ -122,21 +122,25 @@ def _tell_faults(entries: list[Entry], word: str) -> list[Entry]:
 
 def site(arguments: argparse.Namespace) -> int:
     """Handle `splashbench benchmark site`."""
-    from splashbench.benchmark.repository import read_benchmark, read_entries
+    from splashbench.benchmark.repository import find_repeats, read_benchmark, read_entries
     from splashbench.benchmark.site import entry_lines, front_page, site_facts
     from splashbench.errors import SplashbenchError
     from splashbench.files import files_together, require_folder_place, write_json, write_text
 
+    if arguments.lpips_weights and not arguments.scenes:
+        arguments.usage_error("--lpips-weights is for --scenes; add it")
     out: Path = arguments.out
     benchmark = read_benchmark(arguments.folder)
     require_folder_place(out)
     if out.is_dir() and any(out.iterdir()) and not (out / _SITE_FILE).is_file():
         raise SplashbenchError(f"{out} holds files that are no site's; give a new or an empty folder")
     entries = read_entries(arguments.folder, benchmark, with_scenes=bool(arguments.scenes))
-    faulty = _tell_faults(entries, "warning: left out")
-    good = [entry for entry in entries if not entry.faults]
     with tempfile.TemporaryDirectory(prefix="splashbench-site-") as scratch:
+        good = [entry for entry in entries if not entry.faults]
         _score_the_rest(good, benchmark, Path(scratch, "scored"), arguments)
+        find_repeats(good)
+        good = [entry for entry in good if not entry.faults]
+        faulty = _tell_faults(entries, "warning: left out")
         text = _leaderboard(good, benchmark, Path(scratch, "results"), arguments)
     lines = entry_lines(benchmark, good, text)
     with files_together(out) as staging:
@@ -153,7 +157,7 @@ def _score_the_rest(entries: list[Entry], benchmark: Benchmark, place: Path, arg
     """Score the submissions of entries that came without results."""
     from splashbench.benchmark.repository import result_fault
     from splashbench.benchmark.scenes import find_scenes
-    from splashbench.errors import SplashbenchError, one_line
+    from splashbench.errors import SplashbenchError
     from splashbench.scene import Scene
     from splashbench.score import score_submission
     from splashbench.submission import Submission
@@ -180,14 +184,13 @@ def _score_the_rest(entries: list[Entry], benchmark: Benchmark, place: Path, arg
                     raise SplashbenchError(f"its result {fault}")
             except SplashbenchError as error:
                 entry.faults.append(f"{entry.folder / name} cannot be scored: {error}")
-                say(f"warning: left out: {one_line(entry.faults[-1])}")
                 continue
             entry.results[result.save(place / entry.name).name] = result
 
 
 def _leaderboard(entries: list[Entry], benchmark: Benchmark, place: Path, arguments: argparse.Namespace) -> str:
     """Make SITE/leaderboard of the entries' results; returns its CSV, "" where there is no result."""
-    from splashbench.cli.main import build_parser
+    from splashbench.cli.main import run_within
     from splashbench.errors import SplashbenchError
 
     board = arguments.out / "leaderboard"
@@ -204,8 +207,6 @@ def _leaderboard(entries: list[Entry], benchmark: Benchmark, place: Path, argume
         words += ["--verify", "--scenes", *map(str, arguments.scenes)]
         words += ["--submissions", *folders] if folders else []
         words += ["--lpips-weights", str(arguments.lpips_weights)] if arguments.lpips_weights else []
-    parsed = build_parser().parse_args(words)
-    status = parsed.handler(parsed)
-    if status:
+    if run_within(words):
         raise SplashbenchError(f"the leaderboard of {arguments.folder} was not made; see the lines above")
     return (board / "leaderboard.csv").read_text(encoding="utf-8")

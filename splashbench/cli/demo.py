@@ -137,14 +137,13 @@ class _Steps:
 
     def always(self, title: str, command: list[str]) -> None:
         """Run `command`; its failure ends the demo."""
-        from splashbench.cli.main import build_parser
+        from splashbench.cli.main import run_within
         from splashbench.errors import SplashbenchError
 
         self._count += 1
         say(f"\n[{self._count}] {title}\n    $ splashbench {shlex.join(command)}")
         start = time.monotonic()
-        parsed = build_parser().parse_args(command)
-        if parsed.handler(parsed) != 0:
+        if run_within(command) != 0:
             raise SplashbenchError(f"the demo stopped at: splashbench {shlex.join(command)}; see the lines above")
         say(f"    {time.monotonic() - start:.1f} s")
 

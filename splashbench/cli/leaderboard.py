@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Of all pictures in the page together; some 400 rows have theirs.
 _MAX_SHEETS_BYTES = 32 << 20
+# Of an earlier leaderboard's table, which is compared with the new one.
+_MAX_TABLE_BYTES = 64 << 20
 _EPILOG = """\
 examples:
   splashbench leaderboard results leaderboard
@@ -167,9 +169,12 @@ def _tell_of_paper(sources: Sequence[ResultFile]) -> None:
 
 def _text(path: Path) -> str | None:
     """What the file `path` says; None where there is none that can be read."""
+    from splashbench.errors import SplashbenchError
+    from splashbench.files import read_plain
+
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        return read_plain(path, _MAX_TABLE_BYTES).decode("utf-8")
+    except (SplashbenchError, OSError, UnicodeDecodeError):
         return None
 
 

@@ -65,6 +65,12 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def run_within(words: list[str]) -> int:
+    """Run another command within this one; returns its exit status."""
+    parsed = build_parser().parse_args(words)
+    return int(parsed.handler(parsed))
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     # Idle OpenMP threads that spin steal cores from the renderer's own; the user's choice wins.

@@ -171,12 +171,12 @@ def run(arguments: argparse.Namespace) -> int:
         # The traceback holds the progress bar that was running; without it the bar ends its line before the error's.
         raise error.with_traceback(None) from None
     rows = [
-        [gate.name, _figure(gate.value), f"{gate.side} {gate.limit:.4g}", "passed" if gate.passed else "WARNING"]
+        [gate.name, gate.figure, f"{gate.side} {gate.limit:.4g}", "passed" if gate.passed else "WARNING"]
         for gate in preparation.gates
     ]
     say(table(["gate", "value", "limit", "outcome"], rows))
     for gate in preparation.warnings:
-        say(f"warning: {gate.name} is {_figure(gate.value)}: {gate.detail}; {gate.remedy}")
+        say(f"warning: {gate.name} is {gate.figure}: {gate.detail}; {gate.remedy}")
     seconds_spent = {name: record.spent for name, record in preparation.stages.items() if not record.reused}
     reused = [name for name, record in preparation.stages.items() if record.reused]
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in seconds_spent.items())
@@ -190,7 +190,3 @@ def run(arguments: argparse.Namespace) -> int:
         passed = not preparation.warnings
         emit({"scene": str(arguments.scene), "passed": passed, **preparation.as_json(), "stages": stages})
     return 0
-
-
-def _figure(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.4g}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from splashbench.cli.arguments import add_lpips_weights, add_settings
 from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, say, table
-from splashbench.cli.verification import verify_results, without_need_of
+from splashbench.cli.verification import verify_results
 
 if TYPE_CHECKING:
     from splashbench.score import Protocol, Result
@@ -47,13 +47,11 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("submissions", nargs="+", type=Path, metavar="SUBMISSION", help="folder of a submission")
     parser.add_argument("--scene", type=Path, required=True, help="folder of the scene the submissions are of")
-    out = parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder the results are written into"
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder the results are written into; required but for --verify"
     )
     parser.add_argument(
-        "--verify",
-        action=without_need_of(out),
-        help="verify results (.json) in the place of submissions; nothing is written",
+        "--verify", action="store_true", help="verify results (.json) in the place of submissions; nothing is written"
     )
     parser.add_argument(
         "--submissions",
@@ -80,6 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.verify:
         return verify_results(arguments)
+    if arguments.out is None:
+        arguments.usage_error("the following arguments are required: --out")
+    if arguments.look_in:
+        arguments.usage_error("--submissions is for --verify; add it")
     protocol = _protocol(arguments.changes)
     sealed = [*arguments.submissions, *([arguments.reference] if arguments.reference else [])]
     require_folder_place(arguments.out)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from pathlib import Path
 
 from splashbench.cli import study_capacity
 from splashbench.cli.arguments import (
     add_lpips_weights,
+    add_methods,
     add_seeds,
     add_settings,
+    add_study_out,
     add_study_runs,
     whole_number,
 )
@@ -66,7 +67,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
     )
     parser.add_argument("spec", metavar="SPEC", help="a TOML file, or the name of a study that is shipped")
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; finished runs in it are reused")
+    add_study_out(parser)
     parser.add_argument(
         "--scenes",
         nargs="+",
@@ -99,15 +100,8 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
         ),
         epilog=_STRESS_EPILOG,
     )
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; finished runs in it are reused")
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        action="extend",
-        required=True,
-        metavar="METHOD[:PRESET][:KEY=VALUE,...]",
-        help="what is run: names of methods, or FILE.py:CLASS; the preset is a method's first by default",
-    )
+    add_study_out(parser)
+    add_methods(parser, "; the preset is a method's first by default", required=True)
     parser.add_argument(
         "--scenes", nargs="+", action="extend", required=True, metavar="SCENE", help="folders of scenes"
     )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from pathlib import Path
 
 from splashbench.cli.arguments import (
     add_lpips_weights,
     add_method,
     add_seeds,
     add_settings,
+    add_study_out,
     add_study_runs,
 )
 from splashbench.cli.command import add_command
@@ -45,7 +45,7 @@ def register(actions: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
     )
     add_method(parser)
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the study; finished runs in it are reused")
+    add_study_out(parser)
     parser.add_argument(
         "--scenes", nargs="+", action="extend", required=True, metavar="SCENE", help="folders of scenes"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,20 +11,6 @@ from splashbench.cli.output import emit, say
 
 if TYPE_CHECKING:
     from splashbench.score.verification import Verification
-
-
-def without_need_of(needed: argparse.Action) -> type[argparse.Action]:
-    """The action of a flag with which the option `needed` may be left out."""
-
-    class Flag(argparse.Action):
-        def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
-            super().__init__(option_strings, dest, nargs=0, default=False, help=help)
-
-        def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
-            setattr(namespace, self.dest, True)
-            needed.required = False
-
-    return Flag
 
 
 def verify_results(arguments: argparse.Namespace) -> int:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 
+from splashbench.processes import RUN_MARK
+
 #: In the environment of a worker and of everything below it, with a value of its own for each worker.
 MARK = "SPLASHBENCH_WORKER"
 #: Marks of processes, which are each process's own.
-_MARKS = (MARK, "SPLASHBENCH_RUN")
+_MARKS = (MARK, RUN_MARK)
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 

@@ -21,15 +21,13 @@ from pathlib import Path
 from typing import Any
 
 from splashbench.child import main
+from splashbench.processes import adopt_orphans, end_descendants, outlive_parent, resident_bytes
 
-_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 _POLL_SECONDS = 0.01
 #: Between looks at a task's memory.
 _MEMORY_SECONDS = 0.2
 #: For a task that is asked to end, before it is killed.
 _END_SECONDS = 15.0
-# For what was killed, until it is gone.
-_KILLED_SECONDS = 5.0
 
 
 def serve(modules: str) -> int:
@@ -42,8 +40,8 @@ def serve(modules: str) -> int:
         os.dup2(nothing.fileno(), 0)
     os.dup2(2, 1)  # whatever a module prints is no answer
     # The end of the input says that the parent is gone, and leaves time to end what runs in an orderly way.
-    _prctl(_PR_SET_PDEATHSIG, 0)
-    _prctl(_PR_SET_CHILD_SUBREAPER, 1)  # whatever a task leaves behind becomes ours
+    outlive_parent()
+    adopt_orphans()
     for module in modules.split(","):
         import_module(module)
     lines = _Lines(commands)
@@ -144,40 +142,7 @@ def _end(process: int) -> None:
 def _keep_below(memory_bytes: int, process: int) -> None:
     """Kill the largest process of a task that takes more memory than it may, so that its run ends as if the system
     had done it."""
-    import psutil
-
-    sizes: dict[int, int] = {}
-    with contextlib.suppress(psutil.Error):
-        root = psutil.Process(process)
-        for each in (root, *root.children(recursive=True)):
-            with contextlib.suppress(psutil.Error):
-                sizes[each.pid] = each.memory_info().rss
+    sizes = resident_bytes(process)
     if sum(sizes.values()) > memory_bytes:
         with contextlib.suppress(OSError):
             os.kill(max(sizes, key=lambda pid: sizes[pid]), signal.SIGKILL)
-
-
-def end_descendants() -> None:
-    """Kill all processes below this one, and what they leave."""
-    import psutil
-
-    deadline = time.monotonic() + _KILLED_SECONDS
-    own = psutil.Process()
-    while time.monotonic() < deadline:
-        left = [process for process in own.children(recursive=True) if process.status() != psutil.STATUS_ZOMBIE]
-        for process in left:
-            with contextlib.suppress(psutil.Error):
-                process.kill()
-        with contextlib.suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
-        if not left:
-            return
-        time.sleep(_POLL_SECONDS)
-
-
-def _prctl(option: int, value: int) -> None:
-    if sys.platform == "linux":
-        import ctypes
-
-        ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0)

@@ -15,6 +15,7 @@ from splashbench.child import child_command
 from splashbench.cluster.environment import MARK
 from splashbench.cluster.work import Work
 from splashbench.cluster.worker import serve
+from splashbench.processes import marked_processes
 
 # A worker whose input ends lets its task end for 15 s, and then kills it.
 _STOP_SECONDS = 25.0
@@ -110,7 +111,6 @@ def _kill_marked(mark: str) -> None:
     """Kill whatever inherited `mark`."""
     import psutil
 
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error, OSError):
-            if process.environ().get(MARK) == mark:
-                process.kill()
+    for process in marked_processes(MARK, mark):
+        with contextlib.suppress(psutil.Error):
+            process.kill()

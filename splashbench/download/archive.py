@@ -168,6 +168,8 @@ def _fetched(
         begin = stream.read(2)
     if begin != b"PK":
         path.unlink()
+        if known.sha256 is None:  # its size is not the archive's
+            Path(f"{path}{_NOTE_SUFFIX}").unlink(missing_ok=True)
         raise SplashbenchError(f"{source.page} is no zip archive, nothing was kept; {remedy}")
     return known
 

@@ -130,6 +130,13 @@ def alone(target: Path, tell: Callable[[str], None]) -> Iterator[None]:
         lock.release()
 
 
+def require_room(folder: Path, needed: int, what: str, remedy: str) -> None:
+    """Raise SplashbenchError where the disk of `folder`, which exists, has less than `needed` bytes for `what`."""
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise SplashbenchError(f"{folder} has room for {megabytes(free)}, and {what} {megabytes(needed)}; {remedy}")
+
+
 class _Download:
     """Brings the file `part` to its full size."""
 
@@ -144,7 +151,10 @@ class _Download:
 
     def run(self) -> bool:
         """Whether bytes of an earlier call are in the file. Raises RefusedError, LostError or SplashbenchError."""
-        self._require_room()
+        missing = self._file.size - self._have()
+        require_room(
+            self._part.parent, missing, f"{self._file.name} takes", "free some space and run the command again"
+        )
         wait, tries, best = self._patience.wait_seconds, 0, self._have()
         with closing(Meter(self._file.name, self._file.size, best)) as meter:
             while self._have() < self._file.size:
@@ -165,14 +175,6 @@ class _Download:
 
     def _have(self) -> int:
         return self._part.stat().st_size if self._part.is_file() else 0
-
-    def _require_room(self) -> None:
-        free, needed = shutil.disk_usage(self._part.parent).free, self._file.size - self._have()
-        if free < needed:
-            raise SplashbenchError(
-                f"{self._part.parent} has room for {megabytes(free)}, and {self._file.name} takes "
-                f"{megabytes(needed)}; free some space and run the command again"
-            )
 
     def _try(self, meter: Meter) -> None:
         """One request. Returns with a file of full size, else raises."""

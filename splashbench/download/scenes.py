@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from splashbench.cache import cache_folder
 from splashbench.download.archive import ArchiveSource, note_path, obtain_archive
-from splashbench.download.fetch import PATIENT, Patience, alone
+from splashbench.download.fetch import PATIENT, Patience, alone, require_room
 from splashbench.download.meter import Meter
 from splashbench.download.unpacking import (
     MESHES,
@@ -25,7 +25,6 @@ from splashbench.download.unpacking import (
     SceneArchive,
     open_archive,
     remove_leftovers,
-    require_room,
 )
 from splashbench.errors import SplashbenchError
 from splashbench.files import list_files, read_model, read_plain, require_folder_place, write_model, write_text
@@ -128,6 +127,9 @@ def download_scenes(
         places = [out / folder / name for folder, name in wanted]
         notes = (out / STATE_FILE, out / _ATTRIBUTION, note_path(out, source))
         remove_leftovers([*places, *(out / MESHES / f"{name}.glb" for name in chosen), *notes])
+        for place in places:
+            if place.exists() and not place.is_dir():
+                raise SplashbenchError(f"{place} is a file, where a scene belongs; move it away")
         missing = [pair for pair, place in zip(wanted, places) if not place.is_dir()]
         if missing:
             archive_path = obtain_archive(out, by_hand, source, tell=tell, patience=patience)
@@ -158,7 +160,8 @@ def _unpack(
         tell(f"left out: {len(contents.others)} files that are no part of the layout, such as {first!r}")
     meshes = [name for name in chosen if name in contents.meshes and not (out / MESHES / f"{name}.glb").is_file()]
     total = sum(contents.bytes_of(*pair) for pair in missing) + sum(contents.meshes[name].file_size for name in meshes)
-    require_room(out, total)
+    remedy = "free some space, or name fewer scenes, or one --variant"
+    require_room(out, total, "the scenes take", remedy)
     tell(f"unpacking {len(missing)} scenes{f' and {len(meshes)} scans of containers' if meshes else ''} into {out}")
     done = 0
     with closing(Meter("unpacking", max(1, total), 0)) as meter:

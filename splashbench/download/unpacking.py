@@ -8,7 +8,6 @@ Each scene is written beside its place and renamed onto it, so that a folder wit
 from __future__ import annotations
 
 import re
-import shutil
 import stat
 import struct
 import zipfile
@@ -22,7 +21,7 @@ from typing import BinaryIO
 from splashbench.download.archive import MAX_ARCHIVE_BYTES
 from splashbench.download.meter import megabytes
 from splashbench.errors import SplashbenchError, one_line
-from splashbench.files import atomic_directory, atomic_path, is_staged_for, open_plain, raise_if_disk_full
+from splashbench.files import atomic_directory, atomic_path, is_staged_for, open_plain, raise_if_disk_full, remove_any
 from splashbench.manifest import load_scenes
 
 #: The folders of the layout: photographs as recorded, and cut to the container.
@@ -43,8 +42,8 @@ _ROOT = r"(?:[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}/){0,3}?"
 _SCENE_FILE = re.compile(rf"{_ROOT}(real_scene|real_scene_crop)/({_WORD})/(.+)", re.DOTALL)
 _MESH_FILE = re.compile(rf"{_ROOT}meshes/({_WORD})\.glb")
 # The records at the end of a zip file that say where its list is (APPNOTE 6.3.10, 4.3.14 to 4.3.16).
-_END, _END_BYTES, _LOCATOR, _LOCATOR_BYTES, _END64 = b"PK\5\6", 22, b"PK\6\7", 20, b"PK\6\6"
-_SATURATED = 0xFFFFFFFF
+_END, _END_BYTES, _LOCATOR, _LOCATOR_BYTES = b"PK\5\6", 22, b"PK\6\7", 20
+_END64, _END64_BYTES = b"PK\6\6", 56
 
 
 @dataclass
@@ -125,7 +124,7 @@ def open_archive(path: Path) -> Iterator[SceneArchive]:
         _check_list(path, stream, size)
         try:
             archive = zipfile.ZipFile(stream)
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error) as error:
+        except (zipfile.BadZipFile, ValueError, NotImplementedError, OverflowError, OSError, struct.error) as error:
             raise SplashbenchError(f"{path} is no whole zip archive ({one_line(str(error))}); fetch it again") from None
         with archive:
             yield SceneArchive(path, archive, _contents(path, archive.infolist(), size))
@@ -139,19 +138,30 @@ def _check_list(path: Path, stream: BinaryIO, size: int) -> None:
     position = end.rfind(_END)
     if position < 0 or len(end) - position < _END_BYTES:
         raise SplashbenchError(f"{path} is no whole zip archive (it has no end); fetch it again")
-    entries, bytes_ = struct.unpack_from("<HI", end, position + 10)
+    short = struct.unpack_from("<HI", end, position + 10)
+    pointed, adjacent = None, None
     before = position - _LOCATOR_BYTES
     if before >= 0 and end[before : before + 4] == _LOCATOR:
         (place,) = struct.unpack_from("<Q", end, before + 8)
-        stream.seek(min(place, size))
-        record = stream.read(56)
-        if len(record) == 56 and record[:4] == _END64:
-            entries, bytes_ = struct.unpack_from("<QQ", record, 32)
-    elif bytes_ == _SATURATED:
-        raise SplashbenchError(f"{path} is no whole zip archive (its list has no size); fetch it again")
+        pointed = _long_record(stream, min(place, size))
+        adjacent = _long_record(stream, max(0, size - tail + before - _END64_BYTES))
     stream.seek(0)
+    # Python takes the adjacent one, wherever the locator points to, else the short one: all have to be small.
+    entries, bytes_ = map(max, zip(adjacent or short, pointed or (0, 0)))
     if entries > MAX_ENTRIES or bytes_ > MAX_LIST_BYTES:
-        raise SplashbenchError(f"{path} lists {entries} files; the release has no more than {MAX_ENTRIES}")
+        raise SplashbenchError(
+            f"{path} lists {entries} files in {bytes_} bytes; the release has no more than {MAX_ENTRIES} in "
+            f"{MAX_LIST_BYTES}"
+        )
+
+
+def _long_record(stream: BinaryIO, place: int) -> tuple[int, ...] | None:
+    """Entries and bytes of the list by the zip64 record at `place`; None where there is none."""
+    stream.seek(place)
+    record = stream.read(_END64_BYTES)
+    if len(record) < _END64_BYTES or not record.startswith(_END64):
+        return None
+    return struct.unpack_from("<QQ", record, 32)
 
 
 def _contents(path: Path, entries: Sequence[zipfile.ZipInfo], size: int) -> Contents:
@@ -176,7 +186,7 @@ def _contents(path: Path, entries: Sequence[zipfile.ZipInfo], size: int) -> Cont
             continue
         if taken:
             raise SplashbenchError(f"{path} holds {_shown(name)} twice; fetch it again")
-        fault = _fault(entry)
+        fault = _fault(entry, size)
         if fault:
             raise SplashbenchError(f"{path}: {_shown(name)} {fault}; nothing was unpacked")
     listed = [*(entry for scene in contents.scenes.values() for entry in scene.values()), *contents.meshes.values()]
@@ -190,7 +200,7 @@ def _contents(path: Path, entries: Sequence[zipfile.ZipInfo], size: int) -> Cont
     return contents
 
 
-def _fault(entry: zipfile.ZipInfo) -> str:
+def _fault(entry: zipfile.ZipInfo, archive_bytes: int) -> str:
     """Why an entry whose name is in the layout is not unpacked; empty where it is."""
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind not in (0, stat.S_IFREG):
@@ -199,6 +209,8 @@ def _fault(entry: zipfile.ZipInfo) -> str:
         return "is encrypted"
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         return "is packed in a way that the release does not use"
+    if not 0 <= entry.header_offset < archive_bytes:
+        return "lies outside the archive"
     largest = _LARGEST[Path(entry.filename).suffix]
     if entry.file_size > largest:
         return f"has {entry.file_size} bytes, more than {largest}"
@@ -214,23 +226,6 @@ def _shown(name: str) -> str:
 def remove_leftovers(places: Iterable[Path]) -> None:
     """Remove what a killed process left half-made beside `places`. Only while nobody else unpacks there."""
     for place in places:
-        if place.parent.is_dir():
-            for path in place.parent.glob(".tmp-*"):
-                if is_staged_for(path, place):
-                    if path.is_dir() and not path.is_symlink():
-                        shutil.rmtree(path, ignore_errors=True)
-                    else:
-                        path.unlink(missing_ok=True)
-
-
-def require_room(out: Path, needed: int) -> None:
-    """Raise SplashbenchError where the disk of `out` has less than `needed` bytes."""
-    place = Path(out).resolve()
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
-    if free < needed:
-        raise SplashbenchError(
-            f"{out} has room for {megabytes(free)}, and the scenes take {megabytes(needed)}; free some space, or name "
-            "fewer scenes, or one --variant"
-        )
+        for path in place.parent.glob(".tmp-*"):
+            if is_staged_for(path, place):
+                remove_any(path)

@@ -13,6 +13,7 @@ from splashbench.files.atomic import (
     files_together,
     is_staged_for,
     raise_if_disk_full,
+    remove_any,
     write_text,
 )
 from splashbench.files.contents import Listing, list_files, sha256_file, tree_bytes
@@ -70,6 +71,7 @@ __all__ = [
     "read_plain",
     "read_png",
     "read_rgba",
+    "remove_any",
     "require_file_place",
     "require_folder_place",
     "require_plain_file",

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splashbench.errors import DiskFullError, SplashbenchError
-from splashbench.files.places import require_file_place, require_folder_place
+from splashbench.files.places import require_file_place, require_folder_place, taken
 from splashbench.files.plain import read_plain
 
 #: What the system says where a file has no room: the disk, the user's quota or the limit of a file's size is reached.
@@ -37,6 +37,14 @@ def is_staged_for(path: Path, output: Path) -> bool:
 def as_asked(path: Path | str) -> str:
     """`path` under the name that the user gave, not that of its staging place."""
     return _STAGED.sub("", str(path))
+
+
+def remove_any(path: Path) -> None:
+    """Remove a file, a link, or a folder with what it holds, as far as that is possible; links are not followed."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -72,16 +80,12 @@ def _put(temporary: Path, path: Path, replace: bool) -> None:
         try:
             os.link(temporary, path)  # unlike a rename it takes no name that another process has just taken
         except FileExistsError:
-            raise _taken(path) from None
+            raise taken(path) from None
         except OSError:
             pass  # a file system without links: what was checked has to do
         else:
             return  # the temporary name goes by itself
     temporary.replace(path)
-
-
-def _taken(path: Path) -> SplashbenchError:
-    return SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
 
 
 def raise_if_disk_full(path: Path | str, error: Exception) -> None:
@@ -156,7 +160,7 @@ def _require_replaceable(
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not replace:
-        raise _taken(path)
+        raise taken(path)
     if not path.is_dir():
         raise SplashbenchError(f"{path} is a file; give the name of a folder")
     if holds is not None and not (path / holds).is_file():

@@ -19,8 +19,13 @@ def require_file_place(path: Path, replace: bool = True) -> None:
     if path.exists() and not path.is_file():
         raise SplashbenchError(f"{path} is a device or pipe; give the name of a file")
     if not replace and os.path.lexists(path):
-        raise SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
+        raise taken(path)
     require_folder_place(path.parent)
+
+
+def taken(path: Path) -> SplashbenchError:
+    """The error for a place where there is something that may not be replaced."""
+    return SplashbenchError(f"{path} exists already; give another place, or --replace to replace it")
 
 
 def require_folder_place(directory: Path) -> None:

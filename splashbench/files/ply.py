@@ -83,14 +83,15 @@ def read_point_cloud(path: Path) -> PointCloud:
     try:
         with open_plain(path) as (stream, size):
             head = stream.read(_MAX_HEADER_BYTES)
-        end = _END.search(head)
-        if not head.startswith((b"ply\n", b"ply\r\n")) or end is None:
-            raise SplashbenchError(f"{path} is no .ply (it has no such header); give the file as the code saved it")
-        count, kind = _header(path, head[: end.start()].decode("ascii", "replace").splitlines())
-        available = (size - end.end()) // kind.itemsize
-        if count > available:
-            raise SplashbenchError(f"{path} is cut short: {available} of {count} points are there; copy it again")
-        points = np.fromfile(path, kind, count, offset=end.end())
+            end = _END.search(head)
+            if not head.startswith((b"ply\n", b"ply\r\n")) or end is None:
+                raise SplashbenchError(f"{path} is no .ply (it has no such header); give the file as the code saved it")
+            count, kind = _header(path, head[: end.start()].decode("ascii", "replace").splitlines())
+            available = (size - end.end()) // kind.itemsize
+            if count > available:
+                raise SplashbenchError(f"{path} is cut short: {available} of {count} points are there; copy it again")
+            stream.seek(end.end())
+            points = np.fromfile(stream, kind, count)
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; let the code save its last iteration") from None
     except (OSError, ValueError, MemoryError) as error:

@@ -1,13 +1,14 @@
 """PNG files held against their specification (W3C, Portable Network Graphics) without decoding a pixel.
 
-Every chunk must be there with its checksum, up to the end's. So a file that was cut or damaged is found in a hundredth
-of the time that decoding takes, and its header can be believed: Pillow, for one, drops the lower half of 16 bits.
+Every chunk must be there with its checksum, up to the end's. So a file that was cut or damaged is found in a few per
+cent of the time that decoding takes, and its header can be believed: Pillow, for one, drops the lower half of 16 bits.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -26,19 +27,23 @@ _MOST_PACKED = 1032
 class PngHeader:
     """width, height in pixels; bits of a channel; colour: "grey", "RGB", "palette", or one "with alpha".
 
-    n_bytes: of its pixels, unpacked, with the filter's byte before each row. row_bytes: of such a row; 0 where it is
-    interlaced, hence has rows of seven lengths. packed: the content of its IDAT chunks.
+    passes: of the unpacked pixels, one or, interlaced, up to seven: (rows, bytes of a row with its filter's byte).
+    packed: the content of its IDAT chunks. is_bare: whether it has no chunk beside the pixels' own. stated: of IHDR.
     """
 
     width: int
     height: int
     bits: int
     colour: str
-    n_bytes: int
-    row_bytes: int
+    passes: tuple[tuple[int, int], ...]
     packed: tuple[memoryview, ...]
     is_bare: bool
     stated: bytes
+
+    @property
+    def n_bytes(self) -> int:
+        """Of its pixels, unpacked, with the filter's byte before each row."""
+        return sum(rows * row_bytes for rows, row_bytes in self.passes)
 
 
 def png_header(content: bytes) -> PngHeader:
@@ -71,18 +76,21 @@ def png_header(content: bytes) -> PngHeader:
     if stated is None or not is_ended:
         raise ValueError("cut short")
     width, height, bits, colour, is_interlaced = stated
-    bits_per_pixel = bits * _CHANNELS[colour]
-    n_bytes = _unpacked_bytes(width, height, bits_per_pixel, is_interlaced)
-    if sum(map(len, packed)) * _MOST_PACKED < n_bytes:
+    passes = tuple(_passes(width, height, bits * _CHANNELS[colour], is_interlaced))
+    chunk = content[len(_SIGNATURE) + 8 :][:_HEADER_BYTES]
+    header = PngHeader(width, height, bits, _COLOURS[colour], passes, tuple(packed), is_bare, chunk)
+    if sum(map(len, packed)) * _MOST_PACKED < header.n_bytes:
         raise ValueError("cut short: it has too few bytes for its pixels")
-    row_bytes = 0 if is_interlaced else 1 + (width * bits_per_pixel + 7) // 8
-    header = content[len(_SIGNATURE) + 8 :][:_HEADER_BYTES]
-    return PngHeader(width, height, bits, _COLOURS[colour], n_bytes, row_bytes, tuple(packed), is_bare, header)
+    return header
 
 
 def bare_png(header: PngHeader) -> bytes:
     """The PNG with its pixels alone: without gamma, profiles, animation and texts, over which decoders stumble."""
-    chunks = [(b"IHDR", header.stated), (b"IDAT", b"".join(header.packed)), (b"IEND", b"")]
+    return png_of([(b"IHDR", header.stated), (b"IDAT", b"".join(header.packed)), (b"IEND", b"")])
+
+
+def png_of(chunks: Iterable[tuple[bytes, bytes]]) -> bytes:
+    """The PNG file of `chunks`, (kind, content) each, with checksums that hold."""
     out = [_SIGNATURE]
     for kind, data in chunks:
         out += [struct.pack(">I", len(data)), kind, data, struct.pack(">I", zlib.crc32(kind + data))]
@@ -97,16 +105,20 @@ def require_pixels(header: PngHeader) -> None:
         raise ValueError(f"its pixels cannot be unpacked: {error}") from None
     if len(unpacked) < header.n_bytes:
         raise ValueError("cut short: pixels are missing")
-    if header.row_bytes and max(unpacked[:: header.row_bytes]) > _LAST_FILTER:
-        raise ValueError("a row has a filter that there is not")
+    start = 0
+    for rows, row_bytes in header.passes:
+        stop = start + rows * row_bytes
+        if max(unpacked[start:stop:row_bytes]) > _LAST_FILTER:
+            raise ValueError("a row has a filter that there is not")
+        start = stop
 
 
-def _unpacked_bytes(width: int, height: int, bits_per_pixel: int, is_interlaced: bool) -> int:
-    total = 0
+def _passes(width: int, height: int, bits_per_pixel: int, is_interlaced: bool) -> Iterator[tuple[int, int]]:
+    """(rows, bytes of a row with its filter's byte) of each pass that has pixels."""
     for x, y, step_x, step_y in _PASSES if is_interlaced else [(0, 0, 1, 1)]:
         columns, rows = -(-(width - x) // step_x), -(-(height - y) // step_y)
-        total += rows * (1 + (columns * bits_per_pixel + 7) // 8) if columns > 0 and rows > 0 else 0
-    return total
+        if columns > 0 and rows > 0:
+            yield rows, 1 + (columns * bits_per_pixel + 7) // 8
 
 
 def _stated(kind: bytes, data: bytes) -> tuple[int, int, int, int, bool]:

@@ -1,12 +1,20 @@
-"""Whether the Gaussian methods can fit on a device of this machine."""
+"""What the Gaussian methods run on: wherever the shared renderer draws."""
 
 from __future__ import annotations
 
+from typing import ClassVar
 
-def device_fault(device: str) -> str | None:
-    """Why nothing can be rendered on `device` here, with the remedy; None where it can."""
-    if device == "cpu":
-        return None
-    from splashbench.render import cuda
+from splashbench.harness.contract import Method
 
-    return cuda.available()
+
+class GaussianMethod(Method):
+    """A method whose fit draws by the shared renderer, on the processor or on a CUDA device."""
+
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+
+    def device_fault(self, device: str) -> str | None:
+        if device == "cpu":
+            return None
+        from splashbench.render import cuda
+
+        return cuda.available()

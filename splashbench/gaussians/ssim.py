@@ -11,7 +11,7 @@ torch's convolutions, which took a third of a fit; on a CUDA device it is those.
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numba
@@ -219,10 +219,15 @@ class _SsimByTorch(torch.autograd.Function):
         return outer * ctx.gradient, None, None
 
 
+@lru_cache
+def _window_on(device: torch.device) -> Tensor:
+    return torch.from_numpy(_WINDOW).to(device)
+
+
 def _blurred(images: Tensor) -> Tensor:
     """The window over each of `images` [n, channels, h, w], zero beyond the border."""
     flat = images.flatten(0, 1)[:, None]
-    window = torch.from_numpy(_WINDOW).to(images.device)
+    window = _window_on(images.device)
     # TF32, which cuDNN takes where it may, would spoil the variances: differences of nearly equal squares.
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         flat = torch.nn.functional.conv2d(flat, window.view(1, 1, -1, 1), padding=(_RADIUS, 0))

@@ -1,7 +1,8 @@
 """The clock of a run, read from outside: what the keeper stamped, and what counts as the fit's time.
 
-A method can write marks of its own into its line (channel.py). It gains nothing by it: what passes between the fit's
-end and the process's end counts as fit, beyond what saving takes, and so does a start that is far too long.
+A method can write marks of its own into its line (channel.py). It gains little by it: what passes between the fit's
+end and the process's end counts as fit, beyond what saving takes, and so does a start that is far too long. What stays
+free is what an honest method may need: START_SECONDS to import, END_SECONDS and the model's bytes to save.
 """
 
 from __future__ import annotations

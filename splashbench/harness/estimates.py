@@ -56,7 +56,7 @@ def estimate(identity: Identity, scene: Scene, kept: Sequence[int]) -> str:
         return ""
     runs = "one fit" if len(own) == 1 else f"{len(own)} fits"
     of = "this scene" if own[0].scene == scene.name else f"a scene of this size ({one_line(own[0].scene)[:60]})"
-    return f"about {_duration(seconds)} to fit, as {runs} with these settings of {of} took on this machine"
+    return f"about {duration(seconds)} to fit, as {runs} with these settings of {of} took on this machine"
 
 
 def note(identity: Identity, scene: Scene, kept: Sequence[int], seconds: float) -> None:
@@ -88,7 +88,8 @@ def _pixels(scene: Scene, kept: Sequence[int]) -> int:
     return len(kept) * sum(scene.cameras[name].width * scene.cameras[name].height for name in scene.train)
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """ "40 s", "8 min" or "2.5 h"."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -13,7 +13,8 @@ def describe(device: str = "cpu") -> dict[str, str | int | float]:
     import psutil
 
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    gpu = _gpu_name() if device.startswith("cuda") else None
+    # Code with a PyTorch of its own may see a card that this one does not.
+    gpu = (_gpu_name(device) or device) if device.startswith("cuda") else None
     return {
         **({"gpu": gpu} if gpu else {}),
         "cpu": _cpu_name(),
@@ -24,10 +25,10 @@ def describe(device: str = "cpu") -> dict[str, str | int | float]:
     }
 
 
-def _gpu_name() -> str | None:
+def _gpu_name(device: str) -> str | None:
     import torch
 
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return torch.cuda.get_device_name(device) if torch.cuda.is_available() else None
 
 
 def _cpu_name() -> str:

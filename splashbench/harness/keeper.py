@@ -8,7 +8,6 @@ heavy is imported, and no thread runs, before the method's process is forked off
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import os
 import select
@@ -16,16 +15,14 @@ import signal
 import socket
 import sys
 import time
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
-_PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 4, 36  # linux/prctl.h
+from splashbench.processes import adopt_orphans, deny_access, end_descendants, end_with_parent
+
 _POLL_SECONDS = 0.02
 # On a busy machine the keeper may be given a processor this much after a mark was made.
 _LATE_SECONDS = 0.5
-#: Until processes that were killed are gone.
-_KILLED_SECONDS = 5.0
 #: Of what a method's process tells: bytes of one phase, and marks.
 _MAX_BYTES, _MAX_MARKS = 64 << 20, 10_000
 
@@ -35,7 +32,7 @@ def keep(request: str, descriptor: str) -> int:
     report = socket.socket(fileno=int(descriptor))
     report.set_inheritable(False)
     ours, theirs = socket.socketpair()
-    _prctl(_PR_SET_CHILD_SUBREAPER, 1)  # whatever the method's process leaves becomes ours
+    adopt_orphans()
     keeper = os.getpid()
     process = os.fork()
     if process == 0:
@@ -43,15 +40,14 @@ def keep(request: str, descriptor: str) -> int:
         ours.close()
         return _carry_out(request, theirs, keeper)
     theirs.close()
-    # No process of this user may read the keeper's memory or take its sockets (root may).
-    _prctl(_PR_SET_DUMPABLE, 0)
+    deny_access()
     stop = _Stop()
     started = time.monotonic()
     line = _Line(ours)
     status = _wait(process, line, stop)
     ended = time.monotonic()
     line.read_rest()
-    strays = _end_descendants()
+    strays = end_descendants()
     told: dict[str, Any] = {
         "started": started,
         "ended": ended,
@@ -69,7 +65,6 @@ def _carry_out(request: str, line: socket.socket, keeper: int) -> int:
     """Carry out the request: what the method's process does, which then ends like any other."""
     from splashbench.harness.channel import Channel
     from splashbench.harness.method_process import carry_out
-    from splashbench.processes import end_with_parent
 
     end_with_parent(keeper)
     return carry_out(request, Channel(line))
@@ -159,47 +154,6 @@ def _wait(process: int, line: _Line, stop: _Stop) -> int:
             return status
 
 
-def _end_descendants() -> list[str]:
-    """Kill what the method's process left behind, and what that leaves; a line for each that was found alive."""
-    strays: list[str] = []
-    deadline = time.monotonic() + _KILLED_SECONDS
-    while time.monotonic() < deadline:
-        left = _children()
-        if not left:
-            break
-        for process, name in left.items():
-            with contextlib.suppress(OSError):
-                os.kill(process, signal.SIGKILL)
-                strays.append(f"{name} (process {process})")
-        _reap()
-        time.sleep(_POLL_SECONDS)
-    _reap()
-    return list(dict.fromkeys(strays))
-
-
-def _reap() -> None:
-    with contextlib.suppress(ChildProcessError):
-        while os.waitpid(-1, os.WNOHANG)[0]:
-            pass
-
-
-def _children() -> dict[int, str]:
-    """Processes whose parent this one is, and that have not ended, with their names."""
-    own, found = os.getpid(), {}
-    for entry in Path("/proc").iterdir() if Path("/proc").is_dir() else ():
-        if not entry.name.isdigit():
-            continue
-        try:
-            text = (entry / "stat").read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            continue
-        name, _, fields = text.partition("(")[2].rpartition(")")
-        state, parent = fields.split()[:2]
-        if int(parent) == own and state != "Z":
-            found[int(entry.name)] = name
-    return found
-
-
 def _end_like(status: int) -> int:
     """The exit code of the method's process; where a signal ended it, end by the same one."""
     if os.WIFSIGNALED(status):
@@ -212,8 +166,3 @@ def _end_like(status: int) -> int:
         time.sleep(1)  # not reached, unless the signal is one that ends nothing here
         return 128 + number
     return os.waitstatus_to_exitcode(status)
-
-
-def _prctl(option: int, value: int) -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0)

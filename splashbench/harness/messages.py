@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from splashbench.submission import Budget, Decision, Status
+from splashbench.submission import Budget, Decision, Record, Status
 
 
 class Request(BaseModel):
@@ -60,6 +60,7 @@ class Outcome(BaseModel):
     """How a phase ended, as the harness's own code in the child process tells it.
 
     It comes from the method's process, so nothing in it is a measurement of time: that is taken outside (clock.py).
+    What no record may have is refused here, not when the submission is read.
 
     Attributes:
         overhead_seconds: of the fit, spent on what runs of a study share; believed in studies alone.
@@ -70,7 +71,7 @@ class Outcome(BaseModel):
     model_config = ConfigDict(extra="forbid")
     status: Status = Status.OK
     reason: str = ""
-    overhead_seconds: float = 0.0
+    overhead_seconds: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     reused: dict[str, float] = {}
     stages: dict[str, float] = {}
     notes: dict[str, str] = {}
@@ -79,5 +80,14 @@ class Outcome(BaseModel):
     render_fps: float | None = None
     primitives_per_frame: float | None = None
     peak_device_memory_bytes: int | None = None
-    settings: dict[str, Any] = {}
     renderer: list[str] = []
+
+    @model_validator(mode="after")
+    def _fits_a_record(self) -> Outcome:
+        shared = (set(Outcome.model_fields) & set(Record.model_fields)) - {"checkpoints"}
+        try:
+            Record.model_validate(self.model_dump(include=shared))
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        return self

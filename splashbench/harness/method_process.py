@@ -110,7 +110,6 @@ def _fit(request: Request, method: Method, scene: TrainingScene, channel: Channe
         stages=run.stages,
         notes=run.notes,
         decisions=run.decisions,
-        settings=config.model_dump(mode="json"),
         peak_device_memory_bytes=_device_peak(),
         renderer=_renderers(),
     )

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import image_size, sha256_file
+from splashbench.files import image_size, list_files, sha256_file
 from splashbench.harness.messages import Failure
 from splashbench.harness.output_checks import check_geometry, check_particles
 from splashbench.scene import Camera, Particles, SignedDistance
@@ -48,12 +48,15 @@ def require_liquid(output: Path, n_frames: int) -> None:
 
 
 def tree_digest(directory: Path) -> str:
-    """SHA-256 over the names and bytes of all files below `directory`, and the places of its links."""
+    """SHA-256 over the names and bytes of all files below `directory`; "" where it is none, or holds other than files
+    and folders."""
     digest = hashlib.sha256()
-    for path in sorted(Path(directory).rglob("*")):
-        name = path.relative_to(directory).as_posix()
-        if path.is_symlink():
-            digest.update(f"{name} -> {path.readlink()}\n".encode())
-        elif path.is_file():
-            digest.update(f"{name} {sha256_file(path)}\n".encode())
+    try:
+        listing = list_files(directory)
+        if listing.faults or directory.is_symlink():
+            return ""
+        for name in listing.names:
+            digest.update(f"{name} {sha256_file(directory / name)}\n".encode())
+    except SplashbenchError:
+        return ""
     return digest.hexdigest()

@@ -19,7 +19,7 @@ from splashbench.harness.messages import Failure, Outcome, Request
 from splashbench.harness.method_process import WARM_UP_FRAMES, requested_views
 from splashbench.harness.outputs import require_liquid, require_views, tree_digest
 from splashbench.harness.watched_process import Watched, watch
-from splashbench.scene import Particles, Scene
+from splashbench.scene import Particles, Scene, TrainingScene
 from splashbench.submission import Checkpoint, Record, Status
 from splashbench.submission.submission import unusable_files
 
@@ -30,12 +30,14 @@ def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     A method that fails gives a record with its status and reason.
     """
     record = Record()
-    outcome, watched = run_phase(scratch, request, _label(request, "fit"))
+    # Before the method runs, which could change its copy of the scene.
+    training = Scene.open(Path(request.scene)).training()
+    outcome, watched = run_phase(scratch, request, _label(request, "fit"), training)
     record = _with_resources(record, outcome, watched)
     if outcome.status != Status.OK:
         return _failed(record, outcome, watched)
     model = Path(request.model)
-    faults = unusable_files(model)
+    faults = ["it is a link"] if model.is_symlink() else unusable_files(model)
     if faults:
         reason = one_line(f"what the method saved is no model: {faults[0]}").replace(f"{model}/", "model/")
         return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
@@ -64,13 +66,19 @@ def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     # What the fit left in its scratch folder is no part of the model, whose bytes are counted.
     _empty(Path(request.scratch))
     saved = tree_digest(model)
-    outcome, watched = run_phase(scratch, request.model_copy(update={"phase": "render"}), _label(request, "render"))
+    rendering = request.model_copy(update={"phase": "render"})
+    outcome, watched = run_phase(scratch, rendering, _label(request, "render"), training)
     record = _with_resources(record, outcome, watched)
-    if outcome.status == Status.OK and tree_digest(model) != saved:
-        outcome = Outcome(status=Status.CRASHED, reason="the model was changed while it was rendered")
     if outcome.status != Status.OK:
         return _failed(record, outcome, watched)
-    checkpoints = [_checkpoint(scratch, staging, request, k, of_fit) for k, of_fit in enumerate(states)]
+    checkpoints = [_checkpoint(scratch, staging, rendering, training, k, of_fit) for k, of_fit in enumerate(states)]
+    if tree_digest(model) != saved:
+        reason = "the model was changed while it was rendered"
+        return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
+    faults = unusable_files(staging)
+    if faults:
+        reason = one_line(f"what the method wrote is no submission: {faults[0]}").replace(f"{staging}/", "")
+        return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
     return record.model_copy(
         update={
             "checkpoints": checkpoints,
@@ -107,14 +115,16 @@ def _fit_time(watched: Watched, storage_bytes: int) -> FitTime | None:
     return None if watched.report is None else fit_time(Report.model_validate(watched.report), storage_bytes)
 
 
-def _checkpoint(scratch: Path, staging: Path, request: Request, number: int, seconds: float) -> Checkpoint:
+def _checkpoint(
+    scratch: Path, staging: Path, request: Request, training: TrainingScene, number: int, seconds: float
+) -> Checkpoint:
     """Render the test views by the state that the fit had after `seconds`; its model is removed then."""
     name = f"{number:02d}"
     model, folder = Path(str(request.checkpoints), name), f"checkpoints/{name}"
     (staging / folder).mkdir(parents=True, exist_ok=True)
-    changes = {"phase": "render", "model": str(model), "output": str(staging / folder), "timing_frames": 0}
+    changes = {"model": str(model), "output": str(staging / folder), "timing_frames": 0}
     only_views = request.model_copy(update={**changes, "exr": False, "only_views": True})
-    outcome, _ = run_phase(scratch, only_views, _label(request, f"after {seconds:.0f} s"))
+    outcome, _ = run_phase(scratch, only_views, _label(request, f"after {seconds:.0f} s"), training)
     storage = tree_bytes(model)
     dynamic = storage - tree_bytes(model / "static")
     shutil.rmtree(model, ignore_errors=True)
@@ -136,16 +146,16 @@ def particles_per_frame(staging: Path) -> float | None:
     return float(Particles.load(path).active.sum(axis=1).mean()) if path.is_file() else None
 
 
-def run_phase(scratch: Path, request: Request, label: str) -> tuple[Outcome, Watched]:
+def run_phase(scratch: Path, request: Request, label: str, training: TrainingScene) -> tuple[Outcome, Watched]:
     """Carry out `request` in a child process. Where it tells no outcome, its exit code and log give one.
 
     An outcome that is told counts only with an exit code of 0 and, of renders, with every file that belongs to them.
+
+    training: the scene of `request`, read before a method could change it.
     """
     path, progress = scratch / "request.json", Path(request.progress)
     progress.unlink(missing_ok=True)
     write_model(path, request)
-    # Before the method runs, which could change its copy of the scene.
-    training = Scene.open(Path(request.scene)).training()
     views = [(camera, t) for camera, t, _ in requested_views(request, training)]
     watched = watch(
         child_command(keeper.keep, path),

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_directory
+from splashbench.files import atomic_directory, remove_any
 from splashbench.harness import estimates, hardware
 from splashbench.harness.contract import Method
 from splashbench.harness.devices import chosen_device
@@ -219,25 +219,15 @@ def without_nulls(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def drop_unwanted(staging: Path, status: Status, keep_model: bool) -> None:
-    """Remove what a failed run may have written, and a model that nobody wants."""
-    if not keep_model or status != Status.OK:
-        _remove_tree(staging / "model")
-    if status != Status.OK:
-        for name in ("renders", "alpha", "exr", "checkpoints"):
-            _remove_tree(staging / name)
-        for name in ("particles.npz", "geometry.npz"):
-            (staging / name).unlink(missing_ok=True)
+    """Remove whatever a failed run has written, and a model that nobody wants."""
+    unwanted = staging.glob("*") if status != Status.OK else [] if keep_model else [staging / "model"]
+    for path in unwanted:
+        remove_any(path)
 
 
 def _folder(path: Path) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def _remove_tree(path: Path) -> None:
-    import shutil
-
-    shutil.rmtree(path, ignore_errors=True)
 
 
 def parse_overrides(pairs: list[str]) -> dict[str, Any]:

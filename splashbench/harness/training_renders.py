@@ -5,10 +5,10 @@ They are made by the child process that renders test views, and kept outside the
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from splashbench.harness.leftovers import scratch_folder
 from splashbench.harness.messages import Outcome, Request
 from splashbench.harness.phases import run_phase
 from splashbench.harness.training_copy import make_training_copy
@@ -35,18 +35,18 @@ def render_training_views(
     A method that fails gives an outcome with its status and reason.
     """
     identity = submission.identity
-    with tempfile.TemporaryDirectory() as folder:
-        scratch = Path(folder)
+    with scratch_folder() as scratch:
+        copy = make_training_copy(scene, scratch / "scene")
         request = Request(
             phase="render",
             method=name,
-            scene=str(make_training_copy(scene, scratch / "scene")),
+            scene=str(copy),
             preset=identity.preset,
             overrides={},  # of a fit; a model is loaded without them
             seed=identity.seed,
             device=identity.device,
             budget_seconds=timeout_seconds,
-            scratch=folder,
+            scratch=str(scratch),
             model=str(submission.directory / "model"),
             output=str(out),
             progress=str(scratch / "progress"),
@@ -54,5 +54,6 @@ def render_training_views(
             exr=False,
             training_views={camera: list(steps) for camera, steps in views.items()},
         )
-        outcome, _ = run_phase(scratch, request, f"{name.rpartition('/')[2][:24]}: training views")
+        label = f"{name.rpartition('/')[2][:24]}: training views"
+        outcome, _ = run_phase(scratch, request, label, Scene.open(copy).training())
     return outcome

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splashbench.processes import RUN_MARK, marked_processes, resident_bytes
 from splashbench.progress import Bar
 
 _POLL_SECONDS = 0.05
@@ -26,8 +27,6 @@ _LOG_TAIL_BYTES = 20_000
 _SILENT_SECONDS = 1.0
 # For a keeper to end what its process left, before it is killed itself.
 _KEEPER_SECONDS = 8.0
-#: In the environment of everything that a watched process starts, with a value of its own for each.
-_MARK = "SPLASHBENCH_RUN"
 
 
 @dataclass
@@ -72,7 +71,7 @@ def watch(
     Memory is the sum of resident sizes over the process tree. It is looked at, and the time measured, every 50 ms.
     """
     environment = dict(os.environ)
-    environment[_MARK] = mark = uuid.uuid4().hex
+    environment[RUN_MARK] = mark = uuid.uuid4().hex
     # Idle OpenMP threads that spin take the renderer's cores: twice the time on two cores.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
     reports, theirs = socket.socketpair()
@@ -153,19 +152,8 @@ def _ask_to_end(process: subprocess.Popen) -> None:
 
 def _tree_memory(pid: int, kept: bool) -> int:
     """Resident bytes of the process and what it started; of a keeper, only of what it keeps."""
-    import psutil
-
-    total = 0
-    try:
-        root = psutil.Process(pid)
-        for process in [*([] if kept else [root]), *root.children(recursive=True)]:
-            try:
-                total += process.memory_info().rss
-            except psutil.Error:
-                continue
-    except psutil.Error:
-        return 0
-    return total
+    sizes = resident_bytes(pid)
+    return sum(sizes.values()) - (sizes.get(pid, 0) if kept else 0)
 
 
 def _kill_group(process: subprocess.Popen) -> None:
@@ -179,12 +167,11 @@ def _kill_marked(mark: str, group: int) -> list[str]:
     import psutil
 
     strays = []
-    for process in psutil.process_iter():
+    for process in marked_processes(RUN_MARK, mark):
         with contextlib.suppress(psutil.Error, OSError):
-            if process.environ().get(_MARK) == mark:
-                if os.getpgid(process.pid) != group:
-                    strays.append(f"{process.name()} (process {process.pid})")
-                process.kill()
+            if os.getpgid(process.pid) != group:
+                strays.append(f"{process.name()} (process {process.pid})")
+            process.kill()
     return strays
 
 
@@ -213,7 +200,10 @@ class ProgressReader:
 
 
 def _tail(log: Path) -> list[str]:
-    with log.open("rb") as stream:
-        stream.seek(max(0, log.stat().st_size - _LOG_TAIL_BYTES))
-        text = stream.read().decode("utf-8", "replace")
+    try:
+        with log.open("rb") as stream:
+            stream.seek(max(0, log.stat().st_size - _LOG_TAIL_BYTES))
+            text = stream.read().decode("utf-8", "replace")
+    except FileNotFoundError:  # the process has removed it
+        return []
     return [line.rstrip()[:300] for line in text.splitlines() if line.strip()][-_LOG_TAIL_LINES:]

@@ -1,22 +1,19 @@
 """Gates of a preparation: figures that tell a sound scene from one that merely was computed.
 
-An essential gate that fails stops `prepare`; any other is a warning in the report. Limits follow from what the figure
-does to a scene, or from what the paper's captures reach. They stand beside the value in the report.
+Limits follow from what the figure does to a scene, or from what the paper's captures reach. They stand beside the value
+in the report.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.container import PlacedContainer
+from splashbench.prepare.gate import Gate
 from splashbench.prepare.masks.provider import MaskHealth
 from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.poses.stillness import MIN_AGREEING, Stillness
@@ -31,46 +28,6 @@ FOCAL_SIGMA = 0.005  # of the focal length: a point at the rig's distance then e
 CENTRE_SIGMA = 5e-3  # metres: what the focal length's limit amounts to a metre away from the scene
 COVERAGE = 0.6  # of the image's cells
 SWEEP_AGAIN = "film the sweep again, slowly and closer, with light enough for sharp frames"
-
-
-@dataclass(frozen=True)
-class Gate:
-    """One figure and its limit. `value` is None where the figure could not be had, which fails."""
-
-    name: str
-    value: float | None
-    limit: float
-    side: Literal["at most", "at least"]
-    detail: str
-    essential: bool = False
-    remedy: str = "film it again"
-
-    @property
-    def outcome(self) -> str:
-        """The figure beside its limit, and what it is."""
-        value = "unknown" if self.value is None else f"{self.value:.4g}"
-        return f"{self.name} is {value}, {self.side} {self.limit:.4g} is needed ({self.detail})"
-
-    @property
-    def passed(self) -> bool:
-        """Whether the value is on the right side of the limit."""
-        if self.value is None or not np.isfinite(self.value):
-            return False
-        return bool(self.value <= self.limit if self.side == "at most" else self.value >= self.limit)
-
-    def as_json(self) -> dict[str, Any]:
-        """The gate as it stands in prepare_report.json."""
-        value = float(self.value) if self.value is not None and np.isfinite(self.value) else None
-        return {
-            "name": self.name,
-            "value": value,
-            "limit": self.limit,
-            "side": self.side,
-            "passed": self.passed,
-            "essential": self.essential,
-            "detail": self.detail,
-            "remedy": self.remedy,
-        }
 
 
 def pixel_limit(width: int) -> float:
@@ -237,7 +194,7 @@ def sync_gates(clocks: Mapping[str, ClockFit], sequence: SequenceSync | None) ->
     whose = "the reference's sound" if clocks[echoing].echo_s < 0 else "its sound"
     throughout = "record again, with irregular claps from the beginning to the end of the recording"
     gates = [
-        Gate("cameras_synchronised", n_found, len(clocks), "at least", f"of {len(clocks)} cameras", essential=True),
+        Gate("cameras_synchronised", n_found, len(clocks), "at least", f"of {len(clocks)} cameras", True, throughout),
         Gate(
             "clock_residual",
             scatter[worst],
@@ -276,7 +233,7 @@ def sync_gates(clocks: Mapping[str, ClockFit], sequence: SequenceSync | None) ->
         whole = sequence.whole_frame_rms_s
         paper = "" if whole is None else f"; {whole * 1e3:.1f} ms after whole-frame shifts, the paper's Sync RMS"
         detail = f"s RMS about the fitted clocks, by the sequence's own sound{paper}{missing}"
-        gates.append(Gate("sequence_sync", sequence.clock_rms_s, HALF_FRAME_S, "at most", detail))
+        gates.append(Gate("sequence_sync", sequence.clock_rms_s, HALF_FRAME_S, "at most", detail, False, throughout))
     return gates
 
 
@@ -432,35 +389,3 @@ def source_gate(share: Mapping[str, float]) -> Gate:
     detail = f"share of the written image, camera {least}"
     remedy = "leave out --no-crop, or film the liquid nearer to the middle of the picture"
     return Gate("pixels_with_source", share[least], 0.999, "at least", detail, False, remedy)
-
-
-def require(gates: Collection[Gate], source: str) -> None:
-    """Raise SplashbenchError where an essential gate failed; it tells of all gates that failed, with their remedies.
-
-    Whoever has to film again wants to do it once.
-    """
-    told = failures(gates)
-    if any(gate.essential and not gate.passed for gate in gates):
-        raise SplashbenchError(f"{source}: {told}")
-
-
-@contextmanager
-def told_with(gates: Iterable[Gate]) -> Iterator[None]:
-    """Where a stage within raises SplashbenchError, add the gates that have failed so far: they may be its reason."""
-    try:
-        yield
-    except SplashbenchError as error:
-        told = failures(gates)
-        raise SplashbenchError(f"{error}. Besides: {told}" if told else str(error)) from error
-
-
-def failures(gates: Iterable[Gate]) -> str:
-    """One line of all gates that failed, those that stop a preparation first; empty where none did."""
-    failed = sorted((gate for gate in gates if not gate.passed), key=lambda gate: not gate.essential)
-    lines: list[str] = []
-    told: set[str] = set()
-    for gate in failed:
-        # A figure with two limits has one remedy.
-        lines.append(f"{gate.outcome}; {'likewise' if gate.remedy in told else gate.remedy.rstrip('.')}")
-        told.add(gate.remedy)
-    return ". ".join(lines)

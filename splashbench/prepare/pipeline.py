@@ -24,6 +24,7 @@ from splashbench.prepare.audio import sync
 from splashbench.prepare.calibration import stage as calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.undistort import Undistorter, pinhole_cameras
+from splashbench.prepare.gate import require, told_with
 from splashbench.prepare.masks import stage as masks
 from splashbench.prepare.masks.provider import Mask
 from splashbench.prepare.masks.session_masks import sam3_provider
@@ -38,7 +39,6 @@ from splashbench.prepare.session import Session
 from splashbench.prepare.stage_cache import Stage, StageStore, facts_of, open_stages
 from splashbench.prepare.video import stage as video
 from splashbench.prepare.video.pour import PourRecordings
-from splashbench.prepare.video.recording import probe
 from splashbench.scene.container import ContainerMesh, read_mesh
 
 WORK_FOLDER = "prepare"  # within the session
@@ -130,7 +130,7 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
         *g.stillness_gates(still, lenses[names[0]].width),
     ]
     # The poses cost minutes and may fail for a reason that these gates know.
-    with g.told_with(gates):
+    with told_with(gates):
         posed = poses.posed_rig(store, rig, calibrations)
         container_masks = containers.container_masks(session.container_folder, undistorters)
         frame = poses.metric_frame(
@@ -151,12 +151,12 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
         *g.metric_gates(frame),
         *g.sampling_gates(sampled),
     ]
-    g.require(gates, str(session.directory))
+    require(gates, str(session.directory))
 
     container = containers.container_stage(store, session, mesh, cameras, container_masks, undistorters)
     if container is not None:
         gates += g.container_gates(container, session.train, lenses[names[0]].width)
-        g.require(gates, str(session.container_mesh))
+        require(gates, str(session.container_mesh))
     record, mask_store = masks.masks_of_frames(
         store, session, pour, options.masks, sampled, undistorters, clocks, interval.start
     )
@@ -211,11 +211,13 @@ def _check_what_later_stages_need(
     mesh: ContainerMesh | None,
 ) -> None:
     """Report at once what can be seen at once, not after the hours of the stages before."""
-    for recording in [*pour.recordings.values(), *rig.videos()]:
-        recording.check()
+    headers = {camera: recording.headers for camera, recording in pour.recordings.items()}
+    for recording in rig.videos():
+        _ = recording.headers
     if mesh is not None:
-        videos = {camera: probe(recording.paths[0]) for camera, recording in pour.recordings.items()}
-        containers.check_masks(session, {name: (info.width, info.height) for name, info in videos.items()})
+        containers.check_masks(
+            session, {camera: (first.width, first.height) for camera, (first, *_) in headers.items()}
+        )
     if options.masks is None and session.masks.provider == "sam3":
         sam3_provider(session, pour.recordings)
 

@@ -12,7 +12,7 @@ from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.crop import PixelBox
-from splashbench.prepare.gates import Gate
+from splashbench.prepare.gate import Gate
 from splashbench.prepare.masks.session_masks import MaskRecord
 from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.poses.stillness import Stillness

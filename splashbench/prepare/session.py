@@ -10,6 +10,7 @@ folder of them stands for a chapter.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -134,17 +135,16 @@ class Session(SessionTable):
         session = validate_model(path, cls, toml.load(path))
         session._directory = directory
         for kind in get_args(Kind):
-            camera_of: dict[Path, str] = {}
-            for camera, chapters in getattr(session.recordings, kind).items():
+            listed = getattr(session.recordings, kind)
+            for camera, chapters in listed.items():
                 for chapter in chapters:
                     session._check(chapter, f"the {kind} recording of camera {camera}", photographs=kind != "pour")
-                    other = camera_of.setdefault((directory / chapter).resolve(), camera)
-                    if other != camera or chapters.count(chapter) > 1:
-                        raise SplashbenchError(
-                            f"{path}: {chapter} is listed twice in [recordings.{kind}]; list every file once"
-                        )
+            session._require_once(
+                f"recordings.{kind}", [chapter for chapters in listed.values() for chapter in chapters]
+            )
         for chapter in session.sweep.files if session.sweep else ():
             session._check(chapter, "the sweep", photographs=True)
+        session._require_once("sweep", session.sweep.files if session.sweep else ())
         if session.masks.folder is not None:
             session._check(session.masks.folder, "the mask folder", folder=True)
         if session.masks.container_folder is not None:
@@ -175,6 +175,17 @@ class Session(SessionTable):
             raise SplashbenchError(
                 f"{self._directory / relative} ({what}) does not exist; restore it or correct {DESCRIPTION}"
             )
+
+    def _require_once(self, table: str, listed: Sequence[str]) -> None:
+        """No file may stand twice in a table, however it is written."""
+        seen: set[Path] = set()
+        for chapter in listed:
+            path = (self._directory / chapter).resolve()
+            if path in seen:
+                raise SplashbenchError(
+                    f"{self._directory / DESCRIPTION}: {chapter} is listed twice in [{table}]; list every file once"
+                )
+            seen.add(path)
 
     @property
     def directory(self) -> Path:

@@ -14,19 +14,12 @@ _FIGURES = [METRICS[name] for name in ("psnr", "ssim", "lpips", "jitter_error")]
 
 def has_reported_figures(scene: str) -> bool:
     """Whether the paper prints figures of this very scene."""
-    from splashbench.paper_figures import paper_rows
-
-    return any(row["scene_set"] == scene.lower() for row in paper_rows())
+    return bool(_rows(scene))
 
 
 def reported_table(scene: str) -> list[str]:
-    """A line of introduction and the table, in Markdown; nothing for a scene of which the paper prints nothing.
-
-    Scenes are matched by name whatever its case, which differs between downloads.
-    """
-    from splashbench.paper_figures import paper_rows
-
-    rows = [row for row in paper_rows() if row["scene_set"] == scene.lower()]
+    """A line of introduction and the table, in Markdown; nothing for a scene of which the paper prints nothing."""
+    rows = _rows(scene)
     if not rows:
         return []
     figures = {
@@ -37,3 +30,10 @@ def reported_table(scene: str) -> list[str]:
         f"As the paper reports it ({rows[0]['source']}), by its own unpublished scorer and not by this protocol:",
         table({"Method": [str(row["method"]) for row in rows], **figures}, right=figures),
     ]
+
+
+def _rows(scene: str) -> list[dict[str, str | float | None]]:
+    """The paper's rows of `scene`, by its name whatever the case, which differs between downloads."""
+    from splashbench.paper_figures import paper_rows
+
+    return [row for row in paper_rows() if row["scene_set"] == scene.lower()]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.files import read_plain
 
 #: endings of mesh files that are read
 FORMATS = (".ply", ".glb", ".obj")
@@ -76,9 +77,14 @@ class ContainerMesh:
         return (np.minimum(self.faces, ends) * len(self.vertices) + np.maximum(self.faces, ends)).ravel()
 
     def placed(self, pose: ArrayLike) -> ContainerMesh:
-        """The mesh moved by `pose` [4, 4], mesh to scene; it may scale and shear."""
+        """The mesh moved by `pose` [4, 4], mesh to scene; it may scale and shear.
+
+        Raises ValueError where that leaves no mesh, or one beyond all bounds.
+        """
         matrix = np.asarray(pose, dtype=np.float64)
-        return ContainerMesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        return ContainerMesh(vertices, self.faces)
 
 
 def _merged(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -107,6 +113,14 @@ def mesh_path(directory: Path, name: str) -> Path:
     if path.suffix.lower() not in FORMATS:
         raise SplashbenchError(f"{where} is {name!r}; convert the mesh to one of {', '.join(FORMATS)}")
     return Path(directory) / path
+
+
+def copy_mesh(source: Path, target: Path, name: str) -> None:
+    """Copy the file that scene.json in `source` names as `container_mesh` to its place in the scene `target`."""
+    content = read_plain(mesh_path(source, name))
+    path = Path(target, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
 
 
 def read_mesh(path: Path) -> ContainerMesh:

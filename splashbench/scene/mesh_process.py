@@ -72,7 +72,7 @@ def carry_out(path: str, folder: str, max_faces: str) -> int:
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_SECONDS, MAX_SECONDS + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
-        vertices, faces = _decoded(Path(path), int(max_faces))
+        vertices, faces = decoded(Path(path), int(max_faces))
     except MemoryError:
         return 1
     except SplashbenchError as error:
@@ -87,7 +87,8 @@ def carry_out(path: str, folder: str, max_faces: str) -> int:
     return 0
 
 
-def _decoded(path: Path, max_faces: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def decoded(path: Path, max_faces: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """`decode` in this process, without limits. Raises whatever trimesh does."""
     import io
 
     import trimesh

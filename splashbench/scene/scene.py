@@ -145,18 +145,23 @@ class Scene:
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
         """Container mask [H, W] of `camera`, or None where the scene has none."""
         path = self.directory / "container_mask" / f"{camera}.png"
-        return self._sized(camera, path, read_gray(path) > 127) if path.is_file() else None
+        return self._sized(camera, path, read_gray(path) > 127) if path.exists() else None
 
     def container_mesh(self) -> ContainerMesh | None:
         """The container as a mesh in scene units, or None where the scene has none.
 
-        Raises SplashbenchError when the file is missing, no mesh, or outside the scene's folder.
+        Raises SplashbenchError when the file is missing, no mesh, or outside the scene's folder, or the pose absurd.
         """
         if self.meta is None or self.meta.container_mesh is None:
             return None
         mesh = read_mesh(mesh_path(self.directory, self.meta.container_mesh))
         pose = self.meta.container_pose
-        return mesh if pose is None else mesh.placed(pose)
+        try:
+            return mesh if pose is None else mesh.placed(pose)
+        except ValueError as error:
+            raise SplashbenchError(
+                f"{self.directory / 'scene.json'}: container_pose leaves {error}; place the container again"
+            ) from None
 
     def _sized(self, camera: str, path: Path, array: Pixels) -> Pixels:
         view = self.cameras[camera]

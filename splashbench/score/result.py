@@ -24,11 +24,10 @@ from splashbench.score.metrics import METRICS, Better
 from splashbench.score.ranges import MEANS_OF_FRAMES, MEANS_OF_VIEWS, MOST, range_fault
 from splashbench.score.settings import Protocol
 from splashbench.submission import Decision, Status, with_current_names
+from splashbench.submission.identity import MAX_CLAIMS, MAX_NAME
 from splashbench.submission.withheld import Withheld
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.+-]+")
-#: Of a result that is read: bytes of its file, figures that its submitter claims, and letters of a name.
-MAX_RESULT_BYTES, MAX_CLAIMS, MAX_NAME = 64 << 20, 1000, 200
 _MAX_HARDWARE = 80
 _STATUSES = frozenset(status.value for status in Status)
 _Figure = Annotated[float, Field(allow_inf_nan=False)]
@@ -173,9 +172,6 @@ class Result(_Frozen):
 
         Raises SplashbenchError for what `splashbench score` never writes, see `faults`.
         """
-        path = Path(path)
-        if path.is_file() and path.stat().st_size > MAX_RESULT_BYTES:
-            raise SplashbenchError(f"{path} is larger than {MAX_RESULT_BYTES >> 20} MiB; no result is")
         result = read_model(path, cls)
         fault = next(result.faults(), None)
         if fault is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -72,8 +73,8 @@ class Evidence:
     submissions: Sequence[Path] = ()
     scenes: Sequence[Path] = ()
     lpips_weights: Path | None = None
-    _found: dict[Path, dict[str, Path]] = field(default_factory=dict)
-    _scenes: list[Scene] | None = None
+    _found: dict[Path, dict[str, Path]] = field(default_factory=dict, init=False, repr=False)
+    _scenes: list[Scene] | None = field(default=None, init=False, repr=False)
 
     def verify(self, result: Result, beside: Path) -> Verification:
         """Score the submission of `result` again. beside: a folder that is looked into before `submissions`."""
@@ -106,7 +107,7 @@ class Evidence:
     def _submission(self, digest: str, beside: Path) -> Path | None:
         for folder in (beside, *self.submissions):
             if folder not in self._found:
-                self._found[folder] = {sha256_file(place / SUMS): place for place in _folders_with(folder, SUMS)}
+                self._found[folder] = dict(_by_digest(folder))
             if digest in self._found[folder]:
                 return self._found[folder][digest]
         return None
@@ -117,8 +118,9 @@ class Evidence:
         wanted = submission.identity
         # Digests take reading every file: those of the same name first.
         for scene in sorted(self._scenes, key=lambda scene: scene.name != wanted.scene):
-            if scene.digest == wanted.scene_digest:
-                return scene
+            with suppress(SplashbenchError, OSError):  # of a scene with a file missing: it is not the one
+                if scene.digest == wanted.scene_digest:
+                    return scene
         return None
 
 
@@ -155,6 +157,13 @@ def _cannot_have(name: str, verified: Result) -> bool:
     if name in ("dpsnr_bg", "spill_rgb"):
         return verified.digests.reference is not None or verified.status != "ok"
     return True
+
+
+def _by_digest(folder: Path) -> Iterator[tuple[str, Path]]:
+    """The submissions at or below `folder`, by digest. One whose list of sums cannot be read has none."""
+    for place in _folders_with(folder, SUMS):
+        with suppress(SplashbenchError, OSError):
+            yield sha256_file(place / SUMS), place
 
 
 def _folders_with(folder: Path, name: str) -> Iterator[Path]:

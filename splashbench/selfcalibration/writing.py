@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.scene import Scene, SceneMeta, write_scene
-from splashbench.scene.container import mesh_path
+from splashbench.scene.container import copy_mesh
 from splashbench.scene.layout import plain_name
 
 from .scene import SelfCalibration
@@ -45,9 +45,7 @@ def write_calibrated(scene: Scene, found: SelfCalibration, directory: Path) -> N
         container_masks={name: mask for name, mask in masks.items() if mask is not None},
     )
     if meta.container_mesh is not None:
-        target = directory / meta.container_mesh
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(mesh_path(scene.directory, meta.container_mesh).read_bytes())
+        copy_mesh(scene.directory, directory, meta.container_mesh)
     particles = scene.truth_particles()
     if particles is not None:
         particles.save(directory / "truth" / "particles.npz")

@@ -20,7 +20,8 @@ from splashbench.child import raise_if_disk_was_full
 from splashbench.cluster.place import workers_at
 from splashbench.cluster.work import Ended, Needs, Work, Workers
 from splashbench.errors import SplashbenchError
-from splashbench.files import require_folder_place, write_model, write_text
+from splashbench.files import remove_any, require_folder_place, write_model, write_text
+from splashbench.harness.estimates import duration
 from splashbench.score.image.lpips import WEIGHTS_VARIABLE, load_lpips
 from splashbench.score.image.weights import weights_path
 from splashbench.study.commit import commit, commit_failure, new_attempt, recover
@@ -244,13 +245,6 @@ class _Progress:
             self._tell(f"failed: {entry.title}: {entry.status}: {entry.reason}")
 
 
-def duration(seconds: float) -> str:
-    """ "40 s", "8 min" or "2.5 h"."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
 def _run_here(jobs: Iterable[Job], store: Store, progress: _Progress) -> None:
     for job in jobs:
         progress.starts(job)
@@ -303,7 +297,7 @@ def _is_there(path: Path, seconds: float) -> bool:
         if time.monotonic() >= deadline:
             return False
         time.sleep(0.1)
-        list(path.parent.iterdir())  # has a network file system look anew
+        list(path.parent.glob("*"))  # has a network file system look anew
     return True
 
 
@@ -314,7 +308,9 @@ def _entry(job: Job, ended: Ended, store: Store) -> RunEntry:
         return commit(store, attempt)
     reason = f"{ended.lost}, {_TRIES} times; give the same command again"
     if not ended.lost:
-        lines = attempt.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        # There is none where the worker could not open it.
+        said = attempt.log.read_text(encoding="utf-8", errors="replace") if attempt.log.is_file() else ""
+        lines = said.strip().splitlines()
         raise_if_disk_was_full(ended.exit_code, lines)
         last = lines[-1] if lines else "it said nothing"
         reason = f"the run's process ended with exit code {ended.exit_code}: {last}"
@@ -340,6 +336,6 @@ def claimed(store: Store) -> Iterator[None]:
     with lock:
         for folder in (store.submissions, *store.cache.glob("*"), *store.cache.glob("scenes/*")):
             for leftover in folder.glob(".tmp-*"):
-                shutil.rmtree(leftover, ignore_errors=True)
+                remove_any(leftover)
         recover(store)
         yield

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, read_model, write_model
 from splashbench.scene import Scene, SceneMeta, write_scene
-from splashbench.scene.container import mesh_path
+from splashbench.scene.container import copy_mesh
 from splashbench.scene.layout import plain_name
 
 _FILE = "between.json"
@@ -91,7 +91,5 @@ def _write(scene: Scene, every: int, kept: range, directory: Path) -> None:
         container_masks={name: mask for name in names if (mask := scene.container_mask(name)) is not None},
     )
     if meta.container_mesh is not None:
-        target = directory / meta.container_mesh
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(mesh_path(scene.directory, meta.container_mesh).read_bytes())
+        copy_mesh(scene.directory, directory, meta.container_mesh)
     write_model(directory / _FILE, Between(scene=str(scene.directory.resolve()), every=every))

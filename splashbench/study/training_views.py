@@ -6,12 +6,12 @@ while those of test views fall, the model learns its photographs by heart.
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from splashbench.harness.leftovers import scratch_folder
 from splashbench.harness.training_renders import render_training_views
 from splashbench.scene import Scene
 from splashbench.score import PROTOCOL_V1
@@ -56,11 +56,11 @@ def score_training_views(
     """Render and score training views of `scene` by the model in `submission` of the method `name`."""
     views = chosen_views(scene)
     lpips, _ = load_lpips(lpips_weights)
-    with tempfile.TemporaryDirectory() as folder:
-        outcome = render_training_views(name, scene, submission, views, Path(folder), timeout_seconds)
+    with scratch_folder() as folder:
+        outcome = render_training_views(name, scene, submission, views, folder, timeout_seconds)
         if outcome.status != Status.OK:
             return TrainingScore(status=outcome.status, reason=outcome.reason, views=views)
-        renders = Views(Path(folder), submission.identity)
+        renders = Views(folder, submission.identity)
         per_view = [[_frame(scene, renders, camera, t, lpips) for t in steps] for camera, steps in views.items()]
     means = {
         metric: _mean([_mean([row.get(metric) for row in rows]) for rows in per_view]) for metric in TRAINING_METRICS

@@ -22,6 +22,8 @@ _MAX_COST = 10**15
 _LARGEST_INTEGER, _MAX_NESTING = 2**63 - 1, 24
 #: Characters of a note in record.json, and notes, at most.
 MAX_NOTE, MAX_NOTES = 500, 50
+#: Letters of a preset's name or a version, and figures that a submitter claims, at most.
+MAX_NAME, MAX_CLAIMS = 200, 1000
 #: Figures by the names that records and results had before version 0.2 -> today's names.
 RENAMED_FIGURES = {"carriers_per_frame": "particles_per_frame"}
 
@@ -59,7 +61,14 @@ def _require_plain(place: str, value: Any, depth: int) -> None:
         raise ValueError(f"{place.rstrip('.')} is a {type(value).__name__}, not text, a number, true or false")
 
 
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("it has control characters")
+    return text
+
+
 _Text = Annotated[str, Field(max_length=1000)]
+_Label = Annotated[str, Field(max_length=MAX_NAME), AfterValidator(_printable)]
 _Table = Annotated[dict[str, Any], AfterValidator(_plain_table)]
 
 
@@ -84,8 +93,8 @@ class Identity(BaseModel):
     schema_version: Literal[1] = 1
     protocol: Literal["v1"] = PROTOCOL
     method: str = Field(pattern=_NAME)
-    method_version: _Text = "1"
-    preset: _Text = "best"
+    method_version: _Label = "1"
+    preset: _Label = "best"
     settings: _Table = Field(default_factory=dict)
     #: KEY=VALUE: settings that were given on top of the preset
     overrides: list[Annotated[str, Field(max_length=100_000)]] = Field(default_factory=list, max_length=1000)
@@ -102,7 +111,7 @@ class Identity(BaseModel):
     splashbench_version: _Text = ""
     hardware: _Table = Field(default_factory=dict)
     #: What the submitter says the figures are; shown beside the verified ones, never instead of them.
-    claimed: dict[str, float] = Field(default_factory=dict)
+    claimed: dict[str, float] = Field(default_factory=dict, max_length=MAX_CLAIMS)
 
     @field_validator("claimed", mode="before")
     @classmethod

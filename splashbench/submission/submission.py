@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import (
+    Listing,
     is_plain_file,
     list_files,
     read_model,
@@ -79,13 +80,17 @@ def seal(directory: Path, identity: Identity, record: Record) -> None:
 def unusable_files(directory: Path) -> list[str]:
     """A line for every link, pipe, device and unusable name below `directory`, and for more files or bytes than a
     submission may have; nothing is opened."""
+    return _listing(directory).faults
+
+
+def _listing(directory: Path) -> Listing:
     try:
         listing = list_files(directory)
     except SplashbenchError as error:
-        return [str(error)]
+        return Listing(faults=[str(error)])
     if listing.bytes > MAX_BYTES:
         listing.faults.append(f"{directory} has more than {MAX_BYTES >> 30} GiB; this is no submission")
-    return listing.faults
+    return listing
 
 
 def identity_text(identity: Identity) -> str:
@@ -179,9 +184,9 @@ def integrity_faults(directory: Path) -> list[str]:
     path = directory / SUMS
     if not path.is_file():
         return [f"{path} is missing"]
-    faults = unusable_files(directory)
-    if faults:
-        return faults
+    listing = _listing(directory)
+    if listing.faults:
+        return listing.faults
     try:
         text = read_plain(path, _MAX_SUMS_BYTES).decode("utf-8")
     except SplashbenchError as error:
@@ -196,8 +201,8 @@ def integrity_faults(directory: Path) -> list[str]:
         if name in listed:
             return [f"{path} lists {name[:200]!r} twice"]
         listed[name] = digest
-    present = {name for name in list_files(directory).names if name != SUMS}
-    faults += [f"{directory / name} is missing" for name in sorted(set(listed) - present)]
+    present = set(listing.names) - {SUMS}
+    faults = [f"{directory / name} is missing" for name in sorted(set(listed) - present)]
     faults += [f"{directory / name} is not listed in {SUMS}" for name in sorted(present - set(listed))]
     sums = (_sum_fault(directory / name, listed[name]) for name in sorted(present & set(listed)))
     return faults + [fault for fault in sums if fault]

@@ -16,6 +16,7 @@ from splashbench.scene import Gaussians, SignedDistance
 from splashbench.submission import to_8bit
 from splashbench.viewer.camera_layer import CameraLayer
 from splashbench.viewer.coloring import PLAIN, colors_of
+from splashbench.viewer.cut_layer import CutLayer
 from splashbench.viewer.cuts import cut
 from splashbench.viewer.exhibit import Exhibit, Extent
 from splashbench.viewer.geometry import quaternion, turned_to
@@ -428,34 +429,3 @@ def coarser(distance: SignedDistance, stride: int) -> SignedDistance:
     if stride == 1:
         return distance
     return SignedDistance(distance.phi[:, ::stride, ::stride, ::stride], distance.origin, distance.voxel * stride)
-
-
-class CutLayer(Layer):
-    """A picture of the signed distance, made anew for each timestep and place. make: returns its node, invisible."""
-
-    def __init__(self, name: str, title: str, lock: RLock, make: Callable[[Moment], Any]) -> None:  # type: ignore[valid-type]
-        super().__init__(name, title, lock)
-        self._make, self._node = make, None
-        self._made: int | None = None
-        self._version = 0
-
-    def show(self, moment: Moment) -> None:
-        """Show the picture where it is of `moment`."""
-        if self._node is not None:
-            self._node.visible = self.on and self._made == moment.t
-
-    def urgent(self, moment: Moment) -> Job | None:
-        """The picture of `moment`."""
-        return (lambda: self._build(moment)) if self.on and self._made != moment.t else None
-
-    def _build(self, moment: Moment) -> None:
-        version = self._version
-        node = self._make(moment)  # takes the place of the one before, whose name it has
-        with self._lock:
-            self._node, self._made = node, moment.t if version == self._version else None
-
-    def settings_changed(self) -> None:
-        """Make it anew."""
-        with self._lock:
-            self._version += 1
-            self._made = None

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from splashbench.benchmark import repository
 from splashbench.benchmark.repository import WORKFLOW, init_benchmark, read_benchmark, read_entries
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
@@ -216,3 +217,40 @@ def test_a_folder_of_something_else_is_not_taken_for_a_site(
     assert "holds files that are no site's" in capsys.readouterr().err
     assert site(tmp_path / "home", tmp_path / "site") == 1
     assert "benchmark.toml is missing; make a benchmark with" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("how", ["file", "link", "too_large"])
+def test_what_is_no_entry_is_named(
+    how: str, benchmark: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = benchmark / "entries"
+    if how == "file":
+        shutil.copy(next((made / "results").glob("nearest_camera__*")), entries / "mine.json")
+    elif how == "link":
+        (entries / "mine").symlink_to(tmp_path / "nowhere")
+    else:
+        monkeypatch.setattr(repository, "MAX_BYTES", 10)
+    (entries / "README.md").write_text("Notes beside the entries.\n")
+    faulty = [entry for entry in read_entries(benchmark, read_benchmark(benchmark)) if entry.faults]
+    (entry,) = faulty
+    assert (len(entry.faults), entry.results) == (1, {})
+    assert {"file": "is no folder", "link": "is a link", "too_large": "MiB, more than"}[how] in entry.faults[0]
+
+
+def test_submissions_that_cannot_be_scored_are_named_and_left_out(benchmark: Path, real: Path, tmp_path: Path) -> None:
+    entry = benchmark / "entries" / "hull"
+    (entry / "run").mkdir(parents=True)
+    (entry / "entry.toml").write_text(FACTS.replace("Grey", "Hull"))
+    (entry / "run" / "submission.toml").write_text("schema_version = 1\n")
+    assert site(benchmark, tmp_path / "site", "--scenes", str(real)) == 0
+    facts = json.loads((tmp_path / "site" / "benchmark_site.json").read_text())
+    assert [each["entry"] for each in facts["entries"]] == ["grey"]
+    (fault,) = facts["left_out"]["hull"]
+    assert fault.startswith("entries/hull/run cannot be scored: ")
+    assert str(tmp_path) not in (tmp_path / "site" / "index.html").read_text()
+
+
+def test_a_benchmark_that_could_not_be_read_again_is_not_made(tmp_path: Path) -> None:
+    with pytest.raises(SplashbenchError, match="title"):
+        init_benchmark(tmp_path / "new", "x" * 101)
+    assert not (tmp_path / "new").exists()

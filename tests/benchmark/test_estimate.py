@@ -70,6 +70,7 @@ def test_places_of_scenes(real: Path, tmp_path: Path) -> None:
     crops = [real / "real_scene_crop" / name for name in ("bowl_001", "tank_002")]
     assert find_scenes([str(real)]) == crops
     assert find_scenes([str(crops[1]), str(real)]) == [crops[1], crops[0]]
+    assert len(find_scenes([str(real), f"{real}/../{real.name}"])) == 2
     assert find_scenes([str(real / "real_scene")])[0].parent.name == "real_scene"
     with pytest.raises(SplashbenchError, match=r"holds no scene .* download scenes"):
         find_scenes([str(tmp_path)])

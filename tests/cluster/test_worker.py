@@ -104,7 +104,6 @@ def test_a_task_that_takes_too_much_memory_is_killed(workers: LocalWorkers, tmp_
 
 
 def test_what_runs_when_workers_are_left_is_stopped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("splashbench.cluster.worker._END_SECONDS", 1.0)
     monkeypatch.syspath_prepend(str(HERE))
     with LocalWorkers(1, ["tasks"]) as workers:
         workers.start(_work("hang", tmp_path))

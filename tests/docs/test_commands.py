@@ -109,7 +109,7 @@ def test_commands_are_accepted(document: Path) -> None:
         "    splashbench ron splashsplat SCENE OUT\n",
         "    splashbench run splashsplat SCENE OUT --pre-set quick\n",
         "    splashbench run splashsplat SCENE\n",
-        "```\nsplashbench score SUBMISSION --scene SCENE\n```\n",
+        "```\nsplashbench score SUBMISSION --out RESULTS\n```\n",
         "    cd x && splashbench prepare\n",
     ],
 )

@@ -23,6 +23,7 @@ class Served:
     Attributes:
         ranges: whether the server knows Range. length: whether it says how long the file is.
         cuts: bytes after which the connection breaks. statuses: answered instead of the file.
+        shifts: by how much the part that comes begins elsewhere than the one that was asked for.
         kind: Content-Type, where it is said. cookie: set by the answer.
         location: of a redirect. pause: seconds after each block of `block` bytes.
         asked: the Range header of each request, "" for none.
@@ -33,6 +34,7 @@ class Served:
     length: bool = True
     cuts: list[int] = field(default_factory=list)
     statuses: list[int] = field(default_factory=list)
+    shifts: list[int] = field(default_factory=list)
     location: str = ""
     pause: float = 0.0
     block: int = 1 << 14
@@ -88,6 +90,8 @@ class FileServer:
         wanted = re.fullmatch(r"bytes=(\d+)-", file.asked[-1])
         start = int(wanted[1]) if wanted and file.ranges else 0
         size = len(file.content)
+        if start and file.shifts:
+            start += file.shifts.pop(0)
         if start >= size > 0:
             request.send_response(416)
             request.send_header("Content-Range", f"bytes */{size}")

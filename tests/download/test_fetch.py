@@ -114,6 +114,14 @@ def test_a_server_that_cannot_continue_is_asked_for_all(server: Any, tmp_path: P
     assert served.asked == ["bytes=1000-", ""]
 
 
+@pytest.mark.parametrize("shift", [-1000, 1000])
+def test_another_part_than_the_one_asked_for_is_never_added(server: Any, tmp_path: Path, shift: int) -> None:
+    file, served = server.add("f.bin", CONTENT, shifts=[shift])
+    (tmp_path / "f.bin.part").write_bytes(CONTENT[:40_000])
+    assert get(file, tmp_path / "f.bin") == CONTENT
+    assert served.asked == ["bytes=40000-", ""]
+
+
 def test_a_wrong_checksum_keeps_nothing(server: Any, tmp_path: Path) -> None:
     file, served = server.add("f.bin", CONTENT)
     assert "has not the SHA-256 " in refusal(replace(file, sha256=hashlib.sha256(b"").hexdigest()), tmp_path / "f.bin")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import random
 import shutil
 import signal
 import stat
+import struct
 import subprocess
 import sys
 import time
@@ -149,6 +149,7 @@ def test_an_address_that_has_run_out_is_asked_for_anew(archive: Path, server: An
         ),
         ("<html><title>Hotel Wi-Fi</title></html>", "a web page came instead of the file (Hotel Wi-Fi)"),
         ('<form id="download-form" action="file:///etc/passwd">', "it leads to file:///etc/passwd"),
+        ("<title>Hotel</title><![<![", "a web page came instead of the file (Hotel)"),
         ('<form id="download-form" action="/uc">', "one page led to another, and none to the file"),
     ],
 )
@@ -164,6 +165,24 @@ def test_a_page_in_place_of_the_archive_tells_the_way_by_hand(
     assert f"open https://drive.example/view in a browser, save it as {tmp_path}/real/real_scene.zip" in message
     assert "--from real_scene.zip" in message
     assert not (tmp_path / "real" / "real_scene.zip").exists()
+
+
+def test_what_is_no_archive_leaves_no_note_that_would_refuse_the_real_one(
+    archive: Path, server: Any, tmp_path: Path
+) -> None:
+    out = tmp_path / "real"
+    server.add("wrong.zip", b"Please log in", kind="application/octet-stream")
+    with pytest.raises(SplashbenchError, match="is no zip archive, nothing was kept"):
+        fetch(out, ArchiveSource(f"{server.url}/wrong.zip", "https://drive.example/view", "real_scene.zip"))
+    assert len(fetch(out, on_drive(server, archive.read_bytes()))) == 2
+
+
+def test_a_file_in_a_scenes_place_is_told_before_anything_is_fetched(archive: Path, tmp_path: Path) -> None:
+    place = tmp_path / "real" / "real_scene_crop" / "bowl_001"
+    place.parent.mkdir(parents=True)
+    place.write_text("notes")
+    with pytest.raises(SplashbenchError, match="is a file, where a scene belongs; move it away"):
+        fetch(tmp_path / "real", by_hand=archive)
 
 
 def test_without_a_network_the_command_says_what_to_do(
@@ -251,7 +270,6 @@ def _as_bomb(new: zipfile.ZipFile) -> None:
 
 
 def _too_large(new: zipfile.ZipFile) -> None:
-    new.writestr("data/real_scene_crop/bowl_001/train_meta2.json", b"")
     new.writestr("data/real_scene_crop/tank_001/train_meta.json", bytes(65 << 20))
 
 
@@ -285,6 +303,47 @@ def test_limits_on_the_list_and_on_the_whole(archive: Path, tmp_path: Path, monk
     monkeypatch.setattr(unpacking, "MAX_GROWTH", 0)
     monkeypatch.setattr(unpacking, "_SMALL", 1000)
     with pytest.raises(SplashbenchError, match="as no release does"), open_archive(archive):
+        pass
+
+
+def with_long_end(archive: Path, path: Path, list_bytes: int | None = None, elsewhere: bool = False) -> Path:
+    """The archive with the end of one that is too large for 32 bits, whose list has `list_bytes`.
+
+    elsewhere: whether the locator points at a second, honest record.
+    """
+    content = archive.read_bytes()
+    position = content.rfind(b"PK\5\6")
+    count, honest, begin = struct.unpack_from("<HII", content, position + 10)
+
+    def record(size: int) -> bytes:
+        return struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, count, count, size, begin)
+
+    records = (record(honest) if elsewhere else b"") + record(list_bytes or honest)
+    locator = struct.pack("<4sIQI", b"PK\6\7", 0, position, 1)
+    short = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
+    path.write_bytes(content[:position] + records + locator + short)
+    return path
+
+
+def test_the_list_of_a_very_large_archive_is_as_long_as_python_will_take_it_for(archive: Path, tmp_path: Path) -> None:
+    with open_archive(with_long_end(archive, tmp_path / "good.zip")) as opened:
+        assert len(opened.contents.scenes) == 4
+    bad = tmp_path / "bad.zip"
+    for elsewhere in (False, True):
+        with (
+            pytest.raises(SplashbenchError, match="lists"),
+            open_archive(with_long_end(archive, bad, list_bytes=1 << 40, elsewhere=elsewhere)),
+        ):
+            pass
+
+
+def test_an_entry_outside_the_archive_is_refused(archive: Path, tmp_path: Path) -> None:
+    content = bytearray(archive.read_bytes())
+    name = content.rfind(b"data/real_scene_crop/tank_002/train_meta.json")  # in the list, which is last
+    content[name - 4 : name] = (0xFFFFFFF0).to_bytes(4, "little")
+    bad = tmp_path / "bad.zip"
+    bad.write_bytes(bytes(content))
+    with pytest.raises(SplashbenchError, match=r"train_meta\.json lies outside the archive"), open_archive(bad):
         pass
 
 
@@ -368,7 +427,7 @@ def test_killed_twenty_times_the_scenes_have_the_same_bytes(archive: Path, serve
     command = [sys.executable, "-m", "splashbench", "download", "scenes", *NAMES, str(out), "--url", source.url]
     draw, killed = random.Random(31), 0
     for _ in range(20):
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ})
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         end = time.monotonic() + draw.uniform(0.3, 2.0)
         while process.poll() is None and time.monotonic() < end:
             time.sleep(0.01)

@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time as clock
@@ -144,3 +145,65 @@ class SavesLink(Good):
 
     def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
         return _SavesMore(super().fit(scene, config, run), lambda folder: (folder / "more").symlink_to("/proc/kcore"))
+
+
+class SavesElsewhere(Good):
+    """Puts a link in the place of its model's folder."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        def move(folder: Path) -> None:
+            shutil.move(folder, run.directory / "elsewhere")
+            folder.symlink_to(run.directory / "elsewhere")
+
+        return _SavesMore(super().fit(scene, config, run), move)
+
+
+class MovesModel(Good):
+    """Puts a link to the same model in the place of its folder, while it is rendered."""
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        fitted = super().load(directory, scene)
+        shutil.move(directory, directory.parent.parent / "elsewhere")
+        directory.symlink_to(directory.parent.parent / "elsewhere")
+        return fitted
+
+
+class RendersElsewhere(Good):
+    """Has its pictures written into a folder of its own."""
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        (directory.parent.parent / "elsewhere").mkdir()
+        (directory.parent / "renders").symlink_to(directory.parent.parent / "elsewhere")
+        return super().load(directory, scene)
+
+
+class TellsNaN(Good):
+    """Has a stage that took no number of seconds."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        run.stages["first"] = float("nan")
+        return super().fit(scene, config, run)
+
+
+class RemovesScratch(Good):
+    """Removes whatever the run has for the while: its log, its copy of the scene, the request."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        shutil.rmtree(run.directory.parent)
+        return super().fit(scene, config, run)
+
+
+class ForgetsViews(Good):
+    """Takes test camera 7 out of its copy of the scene, so that it has fewer views to render."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        path = scene.directory / "test_meta.json"
+        split = json.loads(path.read_text())
+        for key in ("k", "w2c", "fn"):
+            split[key] = [of_frame[:1] for of_frame in split[key]]
+        path.write_text(json.dumps(split))
+        path = scene.directory / "scene.json"
+        meta = json.loads(path.read_text())
+        meta["sizes"].pop("7")
+        path.write_text(json.dumps(meta))
+        return super().fit(scene, config, run)

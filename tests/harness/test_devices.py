@@ -41,6 +41,8 @@ def test_the_machine_names_its_gpu_where_one_is_used(monkeypatch: pytest.MonkeyP
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA Example")
-    assert hardware.describe("cuda")["gpu"] == "NVIDIA Example"
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"NVIDIA Example at {device}")
+    assert hardware.describe("cuda:1")["gpu"] == "NVIDIA Example at cuda:1"
     assert "gpu" not in hardware.describe()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert hardware.describe("cuda:1")["gpu"] == "cuda:1"

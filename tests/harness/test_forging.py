@@ -208,3 +208,30 @@ def test_pipes_and_links_are_no_model(balls_directory: Path, tmp_path: Path, nam
     assert submission.status == Status.CRASHED
     assert submission.reason.startswith(f"what the method saved is no model: model/{said}")
     assert not (tmp_path / "out" / "model").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("SavesElsewhere", "what the method saved is no model: it is a link"),
+        ("MovesModel", "the model was changed while it was rendered"),
+        ("RendersElsewhere", "what the method wrote is no submission: renders is a link"),
+        ("TellsNaN", "stages.first: Input should be"),
+        ("RemovesScratch", "scene is not a folder"),
+    ],
+)
+def test_whatever_a_method_does_there_is_a_submission_with_a_reason(
+    balls_directory: Path, tmp_path: Path, name: str, said: str
+) -> None:
+    submission = _run(name, balls_directory, tmp_path / "out")
+    assert submission.status == Status.CRASHED
+    assert said in submission.reason
+    assert not {path.name for path in (tmp_path / "out").iterdir()} & {"model", "renders", "alpha"}
+
+
+def test_views_that_a_method_takes_out_of_its_copy_of_the_scene_are_missed(
+    balls_directory: Path, tmp_path: Path
+) -> None:
+    submission = _run("ForgetsViews", balls_directory, tmp_path / "out")
+    assert submission.status == Status.INCOMPLETE
+    assert submission.reason == "camera 7, timestep 0: there is no picture in renders"

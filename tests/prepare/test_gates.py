@@ -16,19 +16,17 @@ from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.container import PlacedContainer
+from splashbench.prepare.gate import Gate, require, told_with
 from splashbench.prepare.gates import (
-    Gate,
     container_gates,
     intrinsics_gates,
     mask_gates,
     metric_gates,
     pixel_limit,
     pose_gates,
-    require,
     sampling_gates,
     source_gate,
     sync_gates,
-    told_with,
 )
 from splashbench.prepare.masks.provider import mask_health
 from splashbench.prepare.poses.metric import MetricFrame
@@ -106,13 +104,15 @@ def test_every_gate_says_what_to_do() -> None:
     )
     gates = [
         *intrinsics_gates({"1": calibration(50.0, 0.1, 9.0)}),
+        *sync_gates({"1": clock(1.0)}, SequenceSync(1.0, {}, ("1",))),
+        *sampling_gates(Sampling(np.zeros(1), np.zeros(1), {}, {}, {"1": np.ones(1, bool)})),
         *pose_gates(poses, ["1", "2"], 480),
         *metric_gates(frame),
         *mask_gates({"1": mask_health([0, 0], 1000)}, 2),
         *container_gates(placed(GOOD | {"1": 0.1, "2": 0.1}), ["1", "2", "3"], 1920),
         source_gate({"1": 0.5}),
     ]
-    assert len(gates) > 18
+    assert len(gates) > 25
     assert [gate.name for gate in gates if gate.remedy == "film it again"] == []
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from splashbench.pages.blocks import Bullets, Table
-from splashbench.prepare.gates import Gate
+from splashbench.prepare.gate import Gate
 from splashbench.prepare.report.gates import gates_section
 from splashbench.prepare.report.page import recorded_on
 

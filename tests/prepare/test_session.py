@@ -123,6 +123,11 @@ def edit(*keys: str, value: Any = None) -> Callable[[dict[str, Any]], None]:
         (edit("train", value=["1"]), "train and test must name every one"),
         (edit("test", value=["2", "3"]), "train and test must name every one"),
         (edit("cameras", value=["1", "1", "3"]), "named twice"),
+        (
+            edit("recordings", "pour", "2", value=["2.MP4", "./2.MP4"]),
+            r"\./2\.MP4 is listed twice in \[recordings\.pour\]",
+        ),
+        (edit("sweep", value={"files": ["2.MP4", "2.MP4"]}), r"2\.MP4 is listed twice in \[sweep\]"),
         (edit("cameras", value=["1", "../x", "3"]), "must consist of letters"),
         (edit("board"), r"needs the \[board\]"),
         (edit("board", "marker_metres", value=0.03), "smaller than square_metres"),

@@ -235,7 +235,8 @@ def test_a_row_opens_its_command_and_record(results: Path, browser: str, tmp_pat
     assert found["shown"]
     assert found["closed"]
     assert (
-        "splashbench run fast scenes/bowl OUT --preset best --seed 1 --checkpoints --set iterations=7" in found["text"]
+        "splashbench run fast scenes/bowl OUT --preset best --seed 1 --device cpu --checkpoints --set iterations=7"
+        in found["text"]
     )
     assert "told: times" in found["text"]
     assert found["stages"] == 4

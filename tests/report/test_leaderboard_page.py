@@ -187,8 +187,10 @@ def test_the_time_to_the_others_quality_charges_failures(results: Path, page_of:
 def test_the_command_makes_the_run_again(make_result: Any, course: Course) -> None:
     result: Result = make_result("alpha", 3, "my bowl", overrides=("a=1", "b=x y"), checkpoints=course((5.0, 20.0)))
     assert command(result) == (
-        "splashbench run alpha 'scenes/my bowl' OUT --preset best --seed 3 --checkpoints --set a=1 --set 'b=x y'"
+        "splashbench run alpha 'scenes/my bowl' OUT --preset best --seed 3 --device cpu --checkpoints "
+        "--set a=1 --set 'b=x y'"
     )
+    assert "--device cuda" in command(result.model_copy(update={"hardware": {"gpu": "NVIDIA Example"}}))
 
 
 def test_an_external_code_has_its_own_command(make_result: Any) -> None:

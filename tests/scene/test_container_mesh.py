@@ -129,6 +129,19 @@ def test_a_missing_mesh_is_named(balls_copy: Path) -> None:
         Scene.open(with_mesh(balls_copy, "gone.ply")).container_mesh()
 
 
+@pytest.mark.parametrize(
+    ("row", "said"), [([1e308, 0, 0, 1e308], "not finite or beyond"), ([1e12, 0, 0, 0], "beyond 1e[+]09")]
+)
+def test_a_pose_that_leaves_no_mesh_is_one_line(row: list[float], said: str, balls_copy: Path) -> None:
+    (balls_copy / "a.ply").write_text(PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    scene = with_mesh(balls_copy, "a.ply")
+    meta = json.loads((scene / "scene.json").read_text())
+    meta["container_pose"] = [row, [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    (scene / "scene.json").write_text(json.dumps(meta))
+    with pytest.raises(SplashbenchError, match=rf"scene\.json: container_pose leaves vertices .*{said}"):
+        Scene.open(scene).container_mesh()
+
+
 def _glb(path: Path, accessors: list[dict], nodes: int = 1, primitives: int = 1) -> Path:
     """A glTF without any data that states `accessors`, and shows the mesh of the first one."""
     header = {

@@ -102,10 +102,19 @@ def test_a_crop_far_from_the_axis_is_no_fault(balls: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["ims/1/000002.png", "seg/6/000001.png", "scene.json", "init_pt_cld.npz", "truth/particles.npz"]
+    "name",
+    [
+        "ims/1/000002.png",
+        "seg/6/000001.png",
+        "scene.json",
+        "init_pt_cld.npz",
+        "truth/particles.npz",
+        "container_mask/1.png",
+    ],
 )
 def test_what_is_no_plain_file_is_one_line_and_not_waited_for(name: str, balls_copy: Path) -> None:
-    (balls_copy / name).unlink()
+    (balls_copy / name).parent.mkdir(exist_ok=True)
+    (balls_copy / name).unlink(missing_ok=True)
     if name == "truth/particles.npz":
         (balls_copy / name).symlink_to("/proc/kmsg")
     else:

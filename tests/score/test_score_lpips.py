@@ -110,13 +110,12 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def unlike_real_ones(monkeypatch: pytest.MonkeyPatch) -> Lpips:
+def unlike_real_ones() -> Lpips:
     """The network with weights at random, biases among them: what it sees of black is not nothing."""
     rng = np.random.default_rng(0)
     arrays = {name: rng.normal(0, 0.05, array.shape).astype(np.float32) for name, array in made_up().items()}
     arrays |= {f"lin{i}": np.abs(arrays[f"lin{i}"]) for i in range(5)}
-    monkeypatch.setattr(module, "WEIGHTS_SHA256", module.weights_digest(arrays))
-    return Lpips(arrays)
+    return Lpips(arrays, module.weights_digest(arrays))
 
 
 def whole_images(metric: Lpips, first: np.ndarray, second: np.ndarray) -> float:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import shutil
-import signal
+import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import pytest
@@ -18,35 +16,12 @@ from pydantic import ValidationError
 
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
-from splashbench.harness.oracle import write_oracle
+from splashbench.files.png import png_of
 from splashbench.scene import Particles, Scene
 from splashbench.submission import Identity, Record, Submission, check_submission, seal
 
 VIEW = "renders/6/000003.png"
-
-
-@pytest.fixture(scope="module")
-def sealed(balls: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("submission") / "oracle"
-    write_oracle(balls, directory)
-    return directory
-
-
-@pytest.fixture
-def copy(sealed: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(sealed, tmp_path / "copy"))
-
-
-@pytest.fixture(autouse=True)
-def _no_hang() -> Iterator[None]:
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise TimeoutError("this hangs")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(60)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
+pytestmark = pytest.mark.usefixtures("no_hang")
 
 
 def reseal(directory: Path) -> None:
@@ -122,11 +97,9 @@ def test_check_refuses_an_image_as_score_does(
 def test_check_finds_forged_pixels_when_asked_to_unpack_them(
     copy: Path, balls: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = b"\x89PNG\r\n\x1a\n"
     header = struct.pack(">IIBBBBB", 96, 64, 8, 2, 0, 0, 0)
-    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(100)) + bytes(100)), (b"IEND", b"")):
-        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    (copy / VIEW).write_bytes(content)
+    pixels = zlib.compress(bytes(100)) + bytes(100)
+    (copy / VIEW).write_bytes(png_of([(b"IHDR", header), (b"IDAT", pixels), (b"IEND", b"")]))
     reseal(copy)
     (line,) = refused(copy, balls, tmp_path, capsys, "--pixels")
     assert VIEW in line
@@ -225,6 +198,23 @@ def test_a_record_that_no_result_could_hold_is_refused(
     (line,) = refused(copy, balls, tmp_path, capsys)
     assert "record.json" in line
     assert said in line
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('preset = "' + "a" * 201 + '"', "preset"),
+        ('method_version = "1\\u001b[31m"', "method_version: it has control characters"),
+        ("claimed = {" + ", ".join(f"c{n} = 1.0" for n in range(1001)) + "}", "claimed"),
+    ],
+)
+def test_what_no_result_may_say_is_refused_before_it_is_scored(
+    line: str, said: str, copy: Path, balls: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = copy / "submission.toml"
+    path.write_text(line + "\n" + re.sub(rf"(?m)^{line.split()[0]} = .*\n|^\[claimed\]\n", "", path.read_text()))
+    (fault,) = refused(copy, balls, tmp_path, capsys)
+    assert f"submission.toml: {said}" in fault
 
 
 def test_a_seed_is_a_number_of_64_bits() -> None:

@@ -1,6 +1,5 @@
 """Submissions: refused when tampered with, and every fault listed at once."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,21 +8,8 @@ from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_png
-from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Particles, Scene
 from splashbench.submission import Identity, Record, Submission, check_submission, to_8bit
-
-
-@pytest.fixture(scope="module")
-def sealed(balls: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("submission") / "oracle"
-    write_oracle(balls, directory)
-    return directory
-
-
-@pytest.fixture
-def copy(sealed: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(sealed, tmp_path / "copy"))
 
 
 def test_a_changed_render_is_refused(copy: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import require_plain_file
+from splashbench.files import read_plain
 
 _ITERATION = re.compile(r"iteration_(\d{1,9})")
 _ARGUMENT = re.compile(r"(\w+)=('(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"|[^,()'\"\[\]]+)")
@@ -47,10 +47,7 @@ class TrainingArguments:
         path = output / "cfg_args"
         if not path.exists():
             return cls(path, {})
-        require_plain_file(path)
-        if path.stat().st_size > _MAX_ARGUMENTS_BYTES:
-            raise SplashbenchError(f"{path} is larger than {_MAX_ARGUMENTS_BYTES >> 10} KiB; give the code's own file")
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = read_plain(path, _MAX_ARGUMENTS_BYTES).decode("utf-8", "replace")
         if not text.lstrip().startswith("Namespace("):
             raise SplashbenchError(f"{path} does not begin with Namespace(; give the file as the code wrote it")
         return cls(path, {match[1]: match[2].strip() for match in _ARGUMENT.finditer(text)})

@@ -10,7 +10,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from splashbench.child import child_command, raise_if_disk_was_full
 from splashbench.files import read_model, write_model
@@ -19,6 +19,7 @@ from splashbench.harness.conformance.recording import OpeningWatch, Touch, read_
 from splashbench.harness.conformance.scene_copies import SceneCopy
 from splashbench.harness.conformance.subject import Answer, Order, Subject
 from splashbench.harness.watched_process import Watched, watch
+from splashbench.processes import marked_processes
 
 #: Every process of a test inherits this variable, with a value of its own: what is left behind is found by it.
 _MARK = "SPLASHBENCH_CONFORMANCE"
@@ -118,8 +119,8 @@ def _killed(mark: str) -> list[str]:
     """Kill the processes that carry `mark` and live on after those of the harness; a line for each."""
     import psutil
 
-    def alive() -> list[Any]:
-        return [process for process in psutil.process_iter() if _carries(process, mark)]
+    def alive() -> list[psutil.Process]:
+        return [process for process in marked_processes(_MARK, mark) if process.pid != os.getpid()]
 
     until = time.monotonic() + _KILLED_SECONDS  # for those that the harness has killed already
     while (left := alive()) and time.monotonic() < until:
@@ -130,16 +131,3 @@ def _killed(mark: str) -> list[str]:
             lines.append(f"{process.name()} (process {process.pid})")
             process.kill()
     return lines
-
-
-def _carries(process: Any, mark: str) -> bool:
-    import psutil
-
-    try:
-        return (
-            process.pid != os.getpid()
-            and process.status() != psutil.STATUS_ZOMBIE
-            and process.environ().get(_MARK) == mark
-        )
-    except (psutil.Error, OSError):
-        return False

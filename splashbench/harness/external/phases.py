@@ -146,14 +146,16 @@ class ExternalRun:
         """Read the output by the importer and render it as a method's model: checked, timed, counted."""
         model = self.staging / "model"
         model.mkdir()
+        copy = make_training_copy(self.scene, self.scratch / "training")
+        training = Scene.open(copy).training()
         request = Request(
             phase="import",
             method=self.code.name,
-            scene=str(make_training_copy(self.scene, self.scratch / "training")),
+            scene=str(copy),
             preset="",
             overrides={},
             seed=self.seed,
-            device=self.device,
+            device="cpu",  # of the importer, not of the code
             budget_seconds=self.timeout_seconds,
             scratch=str(self.scratch),
             model=str(model),
@@ -166,9 +168,8 @@ class ExternalRun:
             export=str(self.exported),
         )
         for phase in ("import", "render"):
-            outcome, watched = run_phase(
-                self.scratch, request.model_copy(update={"phase": phase}), f"{self.code.name[:24]}: {phase}"
-            )
+            of_phase = request.model_copy(update={"phase": phase})
+            outcome, watched = run_phase(self.scratch, of_phase, f"{self.code.name[:24]}: {phase}", training)
             self._watched(watched)
             if outcome.status != Status.OK:
                 raise Failure(outcome.status, outcome.reason)

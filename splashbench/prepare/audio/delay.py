@@ -9,6 +9,7 @@ emptiness do not vote.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,22 @@ class DelayWindow:
     time_s: float
     delay_s: float
     prominence: float
+
+
+@dataclass(frozen=True)
+class PeakEvidence:
+    """How the correlation peak on a clock line compares with others, over all sound in common.
+
+    Attributes:
+        near: its height over the highest within `NEAR_S`, by GCC-PHAT, which tells reflections apart.
+        far: its height over the highest at any other lag, by the correlation of whole recordings.
+        earlier_s: how much earlier than the chosen one, in seconds, a weaker arrival of the same sound comes: positive
+            in y, negative in x, 0 where none does.
+    """
+
+    near: float
+    far: float
+    earlier_s: float
 
 
 def coarse_lags(x: Samples, y: Samples, rate: int) -> list[float]:
@@ -171,22 +188,26 @@ def measure_span(
     return DelayWindow(float(middle), float(line[0] + (line[1] - 1) * middle + lag), _prominence(window, at, fine_rate))
 
 
-def peak_ratios(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> tuple[float, float]:
-    """Height of the correlation peak on the clock line over the highest within `NEAR_S`, and over that at other lags.
-
-    Lags nearby are compared with GCC-PHAT over all sound in common, which tells reflections apart; all others by the
-    correlation of whole recordings.
-    """
+def peak_evidence(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> PeakEvidence:
+    """What speaks for the clock line against all others; zeros without sound in common."""
     span = (max(0.0, -line[0]), min(len(y) / rate, len(x) / rate - line[0]))
-    correlation = _correlate(x, y, rate, line, span, 8192)
+    spectra: list[Floats] = []
+    correlation = _correlate(x, y, rate, line, span, 8192, spectra)
     if correlation is None:
-        return 0.0, 0.0
+        return PeakEvidence(0.0, 0.0, 0.0)
+    return PeakEvidence(
+        _near_ratio(correlation, rate), _far_ratio(x, y, rate, line), _earlier_arrival(correlation, spectra, rate)
+    )
+
+
+def _near_ratio(correlation: Floats, rate: int) -> float:
+    """Height of the peak at lag 0 over the highest within `NEAR_S`."""
     fine_rate = rate * _UPSAMPLING
     half = round(NEAR_S * fine_rate)
     window = np.roll(correlation, half)[: 2 * half + 1]
     near = round(_NEIGHBOURHOOD_S * fine_rate)
     at = half - near + int(np.argmax(window[half - near : half + near + 1]))
-    return _prominence(window, at, fine_rate), _far_ratio(x, y, rate, line)
+    return _prominence(window, at, fine_rate)
 
 
 def _far_ratio(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> float:
@@ -240,17 +261,15 @@ def _levelled(flat: Samples, low: float, share: float) -> Samples:
     return levelled
 
 
-def earlier_arrival(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> float:
-    """How much earlier than the chosen one, in seconds, a weaker arrival of the same sound comes; 0 where none does.
+def _earlier_arrival(correlation: Floats, spectra: Sequence[Floats], rate: int) -> float:
+    """`PeakEvidence.earlier_s` by the correlation along the line and its `spectra` (see `_correlate`).
 
-    Positive in y, negative in x. A reflection louder than the direct sound makes the line follow it. The correlation
+    A reflection louder than the direct sound makes the line follow it. The correlation
     then has a second peak at the direct sound's delay, but so has one with a weaker reflection in the other
     recording. The two differ in whose own echo it is, which each recording's autocorrelation shows. A voice's pitch
     is in both alike, and left to right, so differences leave it out.
     """
-    lags, other_peak, echo_of_y = _echoes(x, y, rate, line)
-    if not len(lags):
-        return 0.0
+    lags, other_peak, echo_of_y = _echoes(correlation, spectra, rate)
     peaks = np.abs(other_peak) >= maximum_filter1d(np.abs(other_peak), round(_SAME_ECHO_S * rate * _UPSAMPLING))
     earlier = peaks & (other_peak * echo_of_y > 0) & (np.abs(echo_of_y) >= _LEAST_OWN_ECHO)
     strength = np.where(earlier, np.abs(other_peak), 0.0)
@@ -258,14 +277,9 @@ def earlier_arrival(x: Samples, y: Samples, rate: int, line: tuple[float, float]
     return float(np.sign(echo_of_y[at]) * lags[at]) if strength[at] >= _LEAST_ECHO else 0.0
 
 
-def _echoes(x: Samples, y: Samples, rate: int, line: tuple[float, float]) -> tuple[Floats, Floats, Floats]:
+def _echoes(correlation: Floats, spectra: Sequence[Floats], rate: int) -> tuple[Floats, Floats, Floats]:
     """Lags up to `ECHO_REACH_S`; the correlation there less that at the negative lag, by the main peak; and what y's
-    autocorrelation has there or next to it beyond x's. Empty without sound in common."""
-    span = (max(0.0, -line[0]), min(len(y) / rate, len(x) / rate - line[0]))
-    spectra: list[Floats] = []
-    correlation = _correlate(x, y, rate, line, span, 8192, spectra)
-    if correlation is None:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
+    autocorrelation has there or next to it beyond x's."""
     fine_rate = rate * _UPSAMPLING
     near = round(_NEIGHBOURHOOD_S * fine_rate / 2)
     centre = int(np.argmax(np.roll(correlation, near)[: 2 * near + 1])) - near

@@ -205,16 +205,16 @@ def _fit_pair(x: Samples, y: Samples, rate: int, rate_prior_sd: float) -> ClockF
     slope = _slope(*_arrays(supporting))
     # The measured slope, not the one that is believed: sounds far apart must fall on one peak.
     steepest = slope.delay - slope.drift * slope.time, 1 + slope.drift
-    near, far = delay.peak_ratios(x, y, rate, steepest)
-    confidence = min(near, far)
+    peak = delay.peak_evidence(x, y, rate, steepest)
+    confidence = min(peak.near, peak.far)
     agreement = len(agreeing) / len(separate)
     confirmed = _confirmed([window.time_s for window in agreeing], width) and agreement >= MIN_AGREEMENT
     if not confirmed or confidence < MIN_CONFIDENCE:
-        stands_out = max(near, far) >= MIN_CONFIDENCE
+        stands_out = max(peak.near, peak.far) >= MIN_CONFIDENCE
         status: Status = "ambiguous" if confirmed else "unconfirmed" if stands_out else "unrelated"
         return _flagged(status, confidence, len(agreeing), agreement)
     fit = _clock(slope, supporting, separate, (begin, end), rate_prior_sd)
-    return replace(fit, confidence=confidence, agreement=agreement, echo_s=delay.earlier_arrival(x, y, rate, steepest))
+    return replace(fit, confidence=confidence, agreement=agreement, echo_s=peak.earlier_s)
 
 
 def _confirmed(times: Sequence[float], width: float) -> bool:

@@ -70,7 +70,10 @@ def decode_audio(
             end += frame.samples / native
     if not pieces:
         raise SplashbenchError(f"{path} has an audio track without a single sample; copy it from the camera again")
-    return [(time, _resample(np.concatenate(blocks), native, rate)) for time, blocks in pieces]
+    joined = [(time, np.concatenate(blocks)) for time, blocks in pieces]
+    if not all(np.isfinite(samples).all() for _, samples in joined):
+        raise SplashbenchError(f"{path} has sound samples that are no numbers; copy it from the camera again")
+    return [(time, _resample(samples, native, rate)) for time, samples in joined]
 
 
 def _mono(frame: Any) -> Samples:

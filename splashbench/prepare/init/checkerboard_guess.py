@@ -4,33 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.prepare.calibration.checkerboard import CheckerboardDetector
+from splashbench.prepare.session_tables import Board
 
 SIDE = 1000  # longer side of the images searched
 MIN_CORNERS = 12  # a tiled floor or a window is now and then taken for a smaller board
 AGREEING = 2  # images that must show a board of the size
 _FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-
-
-@dataclass
-class _Layout:
-    """A checkerboard of unit squares, for a detector."""
-
-    squares_x: int
-    squares_y: int
-    kind: Literal["charuco", "checkerboard"] = "checkerboard"
-    square_metres: float = 1.0
-    marker_metres: float | None = None
-    dictionary: str | None = None
-    legacy: bool = False
-    inverted: bool = False
 
 
 def board_corners(image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
@@ -57,9 +42,10 @@ def guess_squares(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int] | None
             sizes[(longer + 1, shorter + 1)] += 1
     # The largest first: parts of a board are seen often, more than the board never.
     for squares in sorted(sizes, key=lambda size: -size[0] * size[1]):
-        if sizes[squares] < AGREEING or min(squares) < 4:
+        if sizes[squares] < AGREEING or min(squares) < 4 or max(squares) > 100:  # what `Board` allows
             continue
-        detector = CheckerboardDetector(_Layout(*squares))
+        board = Board(kind="checkerboard", squares_x=squares[0], squares_y=squares[1], square_metres=1.0)
+        detector = CheckerboardDetector(board)
         if sum(detector.detect_true(image) is not None for image in images) >= AGREEING:
             return squares
     return None

@@ -108,7 +108,7 @@ def _one_of_each(folder: Path, recordings: list[FoundRecording]) -> list[FoundRe
 def _bytes(folder: Path, recording: FoundRecording) -> int:
     paths = [folder / name for name in recording.files]
     files = [file for path in paths for file in (path.iterdir() if path.is_dir() else [path])]
-    return sum(file.stat().st_size for file in files)
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _board_images(folder: Path, recordings: Sequence[FoundRecording]) -> list[NDArray[np.uint8]]:

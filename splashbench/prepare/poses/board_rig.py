@@ -26,11 +26,18 @@ from splashbench.arrays import Indices
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.calibration.board import BoardView
 from splashbench.prepare.calibration.lens import Array, Lens
-from splashbench.prepare.poses.covariance import cross_matrices, inverse_without_gauge, similarity_generators
+from splashbench.prepare.poses.covariance import (
+    are_determined,
+    cross_matrices,
+    inverse_without_gauge,
+    relative_variances,
+    similarity_generators,
+)
 from splashbench.prepare.poses.structure_from_motion import Poses
 
 MIN_SHARED = 3  # instants that a camera must share with one that has a pose: fewer are too easily all wrong
 MAX_ROUNDS, MAX_STEPS = 4, 60
+MIN_DAMPING = 1e-10  # of the diagonal: without any, the equations are singular along the gauge
 OUTLIER_FACTOR = 3.0  # a sighting this many times worse than the median one is blurred or misread
 HUBER = 1.345  # standard deviations beyond which a residual weighs less
 MIN_OUTLIER_PX = 0.5
@@ -78,7 +85,6 @@ def board_poses(
     ]
     ordered = [lenses[camera] for camera in cameras]
     seen, state = _first_guess(cameras, seen, ordered)
-    seen = _shared(seen)
     for _ in range(MAX_ROUNDS):
         state = _adjusted(state, seen, ordered)
         errors = np.array([np.sqrt((_residuals(state, s, ordered) ** 2).sum(1).mean()) for s in seen])
@@ -86,8 +92,8 @@ def board_poses(
         kept = _shared([s for s, error in zip(seen, errors) if error <= limit])
         if len(kept) == len(seen):
             break
+        _require_linked(cameras, kept)
         seen = kept
-    _require_shared(cameras, seen)
     return _collected(cameras, state, seen, ordered, lens_covariance or {})
 
 
@@ -98,27 +104,25 @@ def _first_guess(cameras: Sequence[str], seen: list[_Seen], lenses: Sequence[Len
         pose = _board_to_camera(s, lenses[s.camera])
         if pose is not None:
             placed[s.camera, s.instant] = pose
-    instants = {c: {k for camera, k in placed if camera == c} for c in range(len(cameras))}
+    seen = _shared([s for s in seen if (s.camera, s.instant) in placed])
+    _require_linked(cameras, seen)
+    instants = _instants(cameras, seen)
     world_to_camera: dict[int, Array] = {0: np.eye(4)}
     while len(world_to_camera) < len(cameras):
-        links = [
+        _, a, b = max(
             (len(instants[a] & instants[b]), -a, -b)
             for a in world_to_camera
-            for b in instants
+            for b in range(len(cameras))
             if b not in world_to_camera
-        ]
-        shared, a, b = max(links)
-        if shared < MIN_SHARED:
-            missing = [cameras[c] for c in range(len(cameras)) if c not in world_to_camera]
-            raise _unlinked(missing)
+        )
         between = [placed[-b, k] @ np.linalg.inv(placed[-a, k]) for k in sorted(instants[-a] & instants[-b])]
         world_to_camera[-b] = _middle_one(between) @ world_to_camera[-a]
     boards: dict[int, Array] = {}
-    for k in sorted({k for _, k in placed}):
-        places = [np.linalg.inv(world_to_camera[c]) @ placed[c, k] for c in range(len(cameras)) if (c, k) in placed]
+    for k in sorted(set().union(*instants)):
+        places = [np.linalg.inv(world_to_camera[c]) @ placed[c, k] for c, own in enumerate(instants) if k in own]
         boards[k] = _middle_one(places)
     numbers = {k: index for index, k in enumerate(boards)}
-    kept = [_Seen(s.camera, numbers[s.instant], s.points, s.pixels) for s in seen if (s.camera, s.instant) in placed]
+    kept = [_Seen(s.camera, numbers[s.instant], s.points, s.pixels) for s in seen]
     matrices = np.array([world_to_camera[c] for c in range(len(cameras))])
     board_matrices = np.array(list(boards.values()))
     return kept, _State(
@@ -157,17 +161,25 @@ def _shared(seen: Sequence[_Seen]) -> list[_Seen]:
     return [s for s in seen if counts[s.instant] > 1]
 
 
-def _require_shared(cameras: Sequence[str], seen: Sequence[_Seen]) -> None:
-    few = [name for c, name in enumerate(cameras) if sum(s.camera == c for s in seen) < MIN_SHARED]
-    if few:
-        raise _unlinked(few)
+def _instants(cameras: Sequence[str], seen: Sequence[_Seen]) -> list[set[int]]:
+    """Of each camera, the instants in which it saw the board."""
+    return [{s.instant for s in seen if s.camera == c} for c in range(len(cameras))]
 
 
-def _unlinked(cameras: Sequence[str]) -> SplashbenchError:
-    return SplashbenchError(
-        f"[recordings.extrinsics]: camera {', '.join(cameras)} and the others see the board together in fewer than"
-        f" {MIN_SHARED} instants; carry it to where this camera and another both see it, and hold it still there"
-    )
+def _require_linked(cameras: Sequence[str], seen: Sequence[_Seen]) -> None:
+    """Raise SplashbenchError where the instants that pairs of cameras share do not join all of them."""
+    instants = _instants(cameras, seen)
+    linked, apart = {0}, set(range(1, len(cameras)))
+    while near := {b for b in apart if any(len(instants[a] & instants[b]) >= MIN_SHARED for a in linked)}:
+        linked |= near
+        apart -= near
+    if apart:
+        fewer = min(apart, linked, key=len)  # the first camera may be the one that saw nothing
+        raise SplashbenchError(
+            f"[recordings.extrinsics]: camera {', '.join(cameras[c] for c in sorted(fewer))} and the others see the"
+            f" board together in fewer than {MIN_SHARED} instants; carry it to where this camera and another both see"
+            " it, and hold it still there"
+        )
 
 
 def _local(state: _State, s: _Seen) -> tuple[Array, Array]:
@@ -212,7 +224,7 @@ def _adjusted(state: _State, seen: Sequence[_Seen], lenses: Sequence[Lens]) -> _
             candidate = _moved(state, change)
             candidate_cost, _ = _cost(candidate, seen, lenses, scale)
             improved = candidate_cost < cost
-            damping = damping / 10 if improved else damping * 10
+            damping = max(damping / 10, MIN_DAMPING) if improved else damping * 10
         if not improved:
             break
         drop = cost - candidate_cost
@@ -277,7 +289,9 @@ def _deviations(
     corners' noise alone; None where the sightings do not determine them."""
     n_cameras = len(state.turns)
     size = 6 * n_cameras
-    normal, independent = np.zeros((size, size)), np.zeros((size, size))
+    if not are_determined(lens_covariance.values()):
+        return None
+    normal = np.zeros((size, size))
     instants = sorted({s.instant for s in seen})
     scores, pushes = [], {c: np.zeros((size, 9)) for c in lens_covariance}
     squares, count = 0.0, 0
@@ -314,23 +328,18 @@ def _deviations(
         inverse = inverse_without_gauge(normal, generators)
     except np.linalg.LinAlgError:
         return None
-    independent = squares / freedom * inverse
-    together = np.stack(scores)
-    clustered = inverse @ (together.T @ together) @ inverse * len(instants) / max(len(instants) - 1, 1)
+    gradients = np.stack(scores)
+    clustered = inverse @ (gradients.T @ gradients) @ inverse * len(instants) / max(len(instants) - 1, 1)
     by_lenses = sum(
         (inverse @ p @ lens_covariance[c] @ p.T @ inverse for c, p in pushes.items()), np.zeros_like(normal)
     )
     radius = float(np.sqrt(((state.centres - state.centres.mean(0)) ** 2).sum(1).mean()))
-    weights = np.tile([1.0, 1.0, 1.0, *([1 / max(radius, 1e-9) ** 2] * 3)], n_cameras)
-    remain = np.eye(size) - generators @ np.linalg.solve(
-        generators.T @ (weights[:, None] * generators), generators.T * weights
+    independent, together, from_lenses = (
+        relative_variances(covariance, generators, max(radius, 1e-9))
+        for covariance in (squares / freedom * inverse, clustered, by_lenses)
     )
-
-    def variances(covariance: Array) -> Array:
-        return np.diag(remain @ covariance @ remain.T).reshape(n_cameras, 2, 3).sum(-1)
-
-    by_corners = np.maximum(variances(independent), variances(clustered))
-    total = by_corners + variances(by_lenses)
+    by_corners = np.maximum(independent, together)
+    total = by_corners + from_lenses
     if not np.isfinite(total).all() or (by_corners < 0).any():
         return None
     return np.sqrt(total), np.sqrt(by_corners)

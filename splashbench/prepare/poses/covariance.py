@@ -17,7 +17,7 @@ distance answers (`scale`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,9 +63,10 @@ def pose_sigmas(
     """
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda i: i.name)
     chosen = [index for index, image in enumerate(images) if image.name in set(names)]
-    if len(chosen) < 2 or not reconstruction.points3D:
+    lens_covariance = lens_covariance or {}
+    if len(chosen) < 2 or not reconstruction.points3D or not are_determined(lens_covariance.values()):
         return None
-    system = _reduced_system(reconstruction, images, fixed_lenses, principal_point_refined, lens_covariance or {})
+    system = _reduced_system(reconstruction, images, fixed_lenses, principal_point_refined, lens_covariance)
     if system is None:
         return None
     centres = np.array([-_rotation(image).T @ _translation(image) for image in images])
@@ -82,14 +83,10 @@ def pose_sigmas(
     by_features = inverse @ system.noise(inverse) @ inverse
     covariance = by_features + inverse @ system.lenses @ inverse
     rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in chosen])
-    gauge = generators[rows]
-    weights = np.tile([1.0, 1.0, 1.0, *([1 / radius**2] * 3)], len(chosen))
-    # What no similarity of the chosen cameras can take away.
-    remain = np.eye(len(rows)) - gauge @ np.linalg.solve(gauge.T @ (weights[:, None] * gauge), gauge.T * weights)
     labels = [images[index].name for index in chosen]
     sigmas: list[dict[str, float]] = []
     for of in (covariance, by_features):
-        squares = np.diag(remain @ of[np.ix_(rows, rows)] @ remain.T).reshape(-1, 2, 3).sum(-1)
+        squares = relative_variances(of[np.ix_(rows, rows)], generators[rows], radius)
         if not np.isfinite(squares).all() or (squares < 0).any():
             return None
         sigmas.append({name: float(np.sqrt(value)) for name, value in zip(labels, squares[:, 1])})
@@ -145,7 +142,8 @@ def _reduced_system(
         n_columns += len(free)
     rows, columns, values, point_rows, point_values, points = [], [], [], [], [], []
     squares: list[float] = []
-    lens_slopes: list[tuple[int, slice, Array]] = []  # COLMAP's camera, rows, derivatives by its lens
+    lens_slopes: list[Array | None] = []  # of each image, its derivatives by its lens where that is uncertain
+    lens_of: list[int] = []  # COLMAP's camera of each image
     ends, n_rows = [], 0
     for index, image in enumerate(images):
         observed = [point for point in image.points2D if point.has_point3D()]
@@ -173,9 +171,9 @@ def _reduced_system(
         point_rows.append(own_rows)
         point_values.append(d_point)
         points.append([numbers[p.point3D_id] for p in observed])
-        if image.camera_id in lens_covariance:
-            slopes = _parameter_jacobian(camera, local, range(9)).reshape(-1, 9)
-            lens_slopes.append((image.camera_id, slice(n_rows, n_rows + len(slopes)), slopes))
+        uncertain = image.camera_id in lens_covariance
+        lens_slopes.append(_parameter_jacobian(camera, local, range(9)).reshape(-1, 9) if uncertain else None)
+        lens_of.append(image.camera_id)
         n_rows += 2 * len(observed)
         ends.append(n_rows)
     unknowns = n_columns + 3 * len(numbers) - 7
@@ -204,21 +202,24 @@ def _reduced_system(
     )
     coupling = (J.T @ J_points).toarray()
     normal, lenses = np.zeros((n_columns, n_columns)), np.zeros((n_columns, n_columns))
-    pushes = {camera_id: np.zeros((n_columns, 9)) for camera_id, _, _ in lens_slopes}
+    pushes = {camera_id: np.zeros((n_columns, 9)) for camera_id in lens_covariance}
     per_image = []
-    slopes_at = {rows.start: (camera_id, slopes) for camera_id, rows, slopes in lens_slopes}
-    for first, last, own_squares in zip([0, *ends], ends, squares):
+    for first, last, own_squares, camera_id, slopes in zip([0, *ends], ends, squares, lens_of, lens_slopes):
         reduced = J[first:last].toarray() - J_points[first:last] @ coupling.T  # what the points cannot account for
         share = reduced.T @ reduced
         by_points = float(J_points[first:last].power(2).sum())
         per_image.append((share, own_squares, last - first, by_points))
         normal += share
-        if first in slopes_at:
-            camera_id, slopes = slopes_at[first]
+        if slopes is not None:
             pushes[camera_id] += reduced.T @ slopes
     for camera_id, push in pushes.items():
         lenses += push @ lens_covariance[camera_id] @ push.T
     return _System(normal, per_image, sum(squares) / (n_rows - unknowns), lenses)
+
+
+def are_determined(lens_covariance: Iterable[Array]) -> bool:
+    """Whether no lens has a parameter that its board left open (see `Calibration`)."""
+    return all(bool(np.isfinite(covariance).all()) for covariance in lens_covariance)
 
 
 def inverse_without_gauge(normal: Array, generators: Array) -> Array:
@@ -234,6 +235,18 @@ def inverse_without_gauge(normal: Array, generators: Array) -> Array:
     factor = linalg.cho_factor(lifted)
     inverse = linalg.cho_solve(factor, np.eye(len(lifted))) - basis @ basis.T
     return np.asarray(inverse * scale[:, None] * scale)
+
+
+def relative_variances(covariance: Array, generators: Array, radius: float) -> Array:
+    """[C, 2]: variances of the turns and centres of C cameras, less the motion that best removes their errors.
+
+    `covariance`: [6C, 6C]; `generators`: [6C, G], of the motions; `radius`: of the rig, which makes a turn and a
+    displacement comparable.
+    """
+    weights = np.tile([1.0, 1.0, 1.0, *([1 / radius**2] * 3)], len(covariance) // 6)
+    weighted = generators.T * weights
+    remain = np.eye(len(covariance)) - generators @ np.linalg.solve(weighted @ generators, weighted)
+    return np.asarray(np.diag(remain @ covariance @ remain.T).reshape(-1, 2, 3).sum(-1))
 
 
 def similarity_generators(R: Array, centre: Array) -> Array:

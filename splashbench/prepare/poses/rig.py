@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +74,7 @@ class RigRecordings:
                 " [recordings.extrinsics] cannot tell how cameras see it; use one with an odd and an even number of"
                 " squares, or a ChArUco board"
             )
+        self._static_pictures: dict[str, Image] = {}
         self._sharpness: list[float] | None = None  # of all frames of the sweep, once they have been looked at
 
     def videos(self) -> list[Recording]:
@@ -95,10 +95,12 @@ class RigRecordings:
 
     def static_image(self, camera: str) -> Image:
         """One camera's picture of the static scene [H, W, 3], the median over its clip."""
-        recording = self.static[camera]
-        count = len(recording.frame_times)
-        indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
-        return poses.static_image([frame for _, frame in recording.frames(indices)])
+        if camera not in self._static_pictures:
+            recording = self.static[camera]
+            count = len(recording.frame_times)
+            indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
+            self._static_pictures[camera] = poses.static_image([frame for _, frame in recording.frames(indices)])
+        return self._static_pictures[camera]
 
     def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> list[Image]:
         """The `count` sharpest frames of the sweep, spread over it; none where there is no sweep."""
@@ -165,15 +167,14 @@ def solve_poses(
     sweep = sweep_images(poses.SWEEP_FRAMES)
     first, second = work / "first", work / "second"
     first.mkdir()
-    find = find_poses if lens_covariance is None else partial(find_poses, lens_covariance=lens_covariance)
     try:
-        return find(static, sweep, lenses, detector, first), sweep
+        return find_poses(static, sweep, lenses, detector, first, lens_covariance), sweep
     except SplashbenchError as error:
         more = sweep_images(2 * poses.SWEEP_FRAMES)
         if len(more) <= len(sweep):
             raise
         second.mkdir()
-        solved = find(static, more, lenses, detector, second)
+        solved = find_poses(static, more, lenses, detector, second, lens_covariance)
         failed = f"{len(sweep)} frames of the sweep: {error}"
         return replace(solved, attempts=(failed, *solved.attempts)), more
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from splashbench.pages.blocks import Block, Bullets, Note, Table
-from splashbench.prepare.gates import Gate
+from splashbench.prepare.gate import Gate
 from splashbench.prepare.preparation import Preparation
 
 # By gate; what is not listed is a share, a count or a ratio, and has none.
@@ -35,7 +33,7 @@ def gates_section(preparation: Preparation) -> list[Block]:
     rows = [
         [
             gate.name.replace("_", " "),
-            _figure(gate),
+            gate.figure if gate.finite is None else _with_unit(gate.figure, gate),
             _with_unit(f"{gate.side} {gate.limit:.4g}", gate),
             "passed" if gate.passed else "failed",
             "stops" if gate.essential else "warns",
@@ -49,13 +47,6 @@ def gates_section(preparation: Preparation) -> list[Block]:
         remedies = [f"{gate.name.replace('_', ' ')}: {gate.remedy}" for gate in preparation.warnings]
         blocks += [Note("What to do about the gates that failed:"), Bullets(remedies)]
     return blocks
-
-
-def _figure(gate: Gate) -> str:
-    """The value with its unit."""
-    if gate.value is None or not np.isfinite(gate.value):
-        return "unknown"
-    return _with_unit(f"{gate.value:.4g}", gate)
 
 
 def _with_unit(text: str, gate: Gate) -> str:

@@ -61,22 +61,25 @@ def split_name(stem: str) -> tuple[str, str, int]:
 def check_chapters(paths: Sequence[Path], facts: Sequence[ChapterFacts]) -> None:
     """Raise SplashbenchError, naming the files and the remedy, where a chapter does not follow the one before it."""
     for index, (before, after) in enumerate(pairwise(paths)):
-        for fault in (
-            _by_name(before, after),
-            _by_timecode(facts[index], facts[index + 1]),
-            _by_creation(facts[index], facts[index + 1]),
-        ):
-            if fault is not None:
-                raise SplashbenchError(f"{after} cannot follow {before.name}: {fault}; {_remedy(paths, facts)}")
+        fault = _by_name(before, after) or _by_timecode(facts[index], facts[index + 1])
+        if fault is None and not _are_named(before, after):  # a copy that names its chapter may be dated anyhow
+            fault = _by_creation(facts[index], facts[index + 1])
+        if fault is not None:
+            raise SplashbenchError(f"{after} cannot follow {before.name}: {fault}; {_remedy(paths, facts)}")
+
+
+def _are_named(*paths: Path) -> bool:
+    """Whether all have a camera's own names, which tell recording and chapter."""
+    return all(split_name(path.stem)[1] for path in paths)
 
 
 def _by_name(before: Path, after: Path) -> str | None:
-    (_, first, earlier), (_, second, later) = split_name(before.stem), split_name(after.stem)
-    if not first or not second:
+    if not _are_named(before, after):
         return None
+    (_, first, earlier), (_, second, later) = split_name(before.stem), split_name(after.stem)
     if first != second:
         return f"it is of recording {second}, not {first}"
-    if later < earlier:
+    if later <= earlier:
         return f"it is chapter {later}, the other {earlier}"
     if later > earlier + 1:
         missing = ", ".join(str(chapter) for chapter in range(earlier + 1, later))

@@ -209,19 +209,19 @@ class Recording:
         return np.concatenate([[0.0], np.cumsum([chapter.duration for chapter in self._chapters])])
 
     @cached_property
-    def _chapter_infos(self) -> tuple[VideoInfo, ...]:
-        infos = tuple(probe(path) for path in self.paths)
-        check_chapters(self.paths, infos)
-        return infos
+    def headers(self) -> tuple[VideoInfo, ...]:
+        """What the headers of its chapters say.
 
-    def check(self) -> None:
-        """Raise SplashbenchError where a file cannot be read, or does not follow the one before it; headers tell."""
-        _ = self._chapter_infos
+        Raises SplashbenchError where a file cannot be read, or does not follow the one before it.
+        """
+        headers = tuple(probe(path) for path in self.paths)
+        check_chapters(self.paths, headers)
+        return headers
 
     @cached_property
     def info(self) -> VideoInfo:
         """Facts of the whole recording; frames are counted. Raises SplashbenchError when chapters do not match."""
-        chapters = self._chapter_infos
+        chapters = self.headers
         for path, chapter in zip(self.paths, chapters):
             if (chapter.width, chapter.height, chapter.codec) != (
                 chapters[0].width,

@@ -230,6 +230,8 @@ def _command(result: Result) -> str:
         return shlex.join(parts)
     parts = ["splashbench", "run", result.method, scene, "OUT"]
     parts += ["--preset", result.preset, "--seed", str(result.seed)]
+    # By default a machine with a GPU would take that, whose fits have other bytes.
+    parts += ["--device", "cuda" if result.hardware.get("gpu") else "cpu"]
     if result.withheld:
         parts += ["--withhold", result.withheld]
     if result.checkpoints:

@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 WEIGHTS_VARIABLE = "SPLASHBENCH_LPIPS_WEIGHTS"
 
 _REMEDY = "run `splashbench download lpips-weights` once, or give --lpips-weights"
-# (stride, padding) of each convolution, and whether a 3x3 max pooling of stride 2 comes before it.
-_CONVOLUTIONS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
-_SHIFT = (-0.030, -0.088, -0.188)
-_SCALE = (0.458, 0.448, 0.450)
-
+#: (stride, padding) of each convolution, and whether a 3x3 max pooling of stride 2 comes before it.
+CONVOLUTIONS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
+#: Of the colours in [-1, 1], before the first convolution: (colour - SHIFT) / SCALE.
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
 
 # A feature of the last layer sees so many pixels, and all grids are the same again after so many.
 _SEEN, _PERIOD = 163, 16
@@ -60,7 +60,7 @@ def _surroundings(differs: NDArray[np.bool_]) -> slice:
 def _feature_count(pixels: int, layer: int) -> int:
     """Features along a side of so many pixels after the convolution `layer`, counted from 0."""
     count = (pixels + 2 * 2 - 11) // 4 + 1
-    for _, _, pooled in _CONVOLUTIONS[1 : layer + 1]:
+    for _, _, pooled in CONVOLUTIONS[1 : layer + 1]:
         count = (count - 3) // 2 + 1 if pooled else count
     return count
 
@@ -68,11 +68,12 @@ def _feature_count(pixels: int, layer: int) -> int:
 class Lpips:
     """The metric with its weights loaded. `digest` names them."""
 
-    def __init__(self, weights: Weights) -> None:
+    def __init__(self, weights: Weights, expected: str = WEIGHTS_SHA256) -> None:
+        """expected: `weights_digest` that they must have; tests and benchmarks have made-up ones."""
         import torch
 
         self.digest = weights_digest(weights)
-        if self.digest != WEIGHTS_SHA256:
+        if self.digest != expected:
             raise SplashbenchError(
                 "the LPIPS weights given are not those of AlexNet v0.1; use torchvision's IMAGENET1K_V1 convolutions "
                 "with the linear weights of the lpips package"
@@ -80,8 +81,8 @@ class Lpips:
         tensors = {name: torch.from_numpy(np.array(array, dtype=np.float32)) for name, array in weights.items()}
         self._convolutions = [(tensors[f"conv{i}.weight"], tensors[f"conv{i}.bias"]) for i in range(1, 6)]
         self._heads = [tensors[f"lin{i}"].reshape(1, -1, 1, 1) for i in range(5)]
-        self._shift = torch.tensor(_SHIFT).reshape(1, 3, 1, 1)
-        self._scale = torch.tensor(_SCALE).reshape(1, 3, 1, 1)
+        self._shift = torch.tensor(SHIFT).reshape(1, 3, 1, 1)
+        self._scale = torch.tensor(SCALE).reshape(1, 3, 1, 1)
 
     def __call__(self, first: Image, second: Image) -> float:
         """Distance of two images [H, W, 3] in [0, 1], 31 px a side or more; exactly 0 for equal ones.
@@ -113,7 +114,7 @@ class Lpips:
 
         activation = (images - self._shift) / self._scale
         features = []
-        for (stride, padding, pooled), (weight, bias) in zip(_CONVOLUTIONS, self._convolutions):
+        for (stride, padding, pooled), (weight, bias) in zip(CONVOLUTIONS, self._convolutions):
             if pooled:
                 activation = F.max_pool2d(activation, 3, 2)
             activation = F.relu(F.conv2d(activation, weight, bias, stride, padding))

@@ -8,8 +8,6 @@ time and no accuracy.
 
 from __future__ import annotations
 
-import itertools
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +52,13 @@ def nearest_poly6_sums(points: NDArray[np.float64], neighbours: int, radius: flo
         return nearest_poly6_sums(points[kept], neighbours, radius)[place]
     sums = np.empty(len(points))
     groups = [(np.arange(len(points)), False)]
-    for level in itertools.count(1):
-        if not groups:
-            return sums
+    level = 0
+    while groups:
+        level += 1
         pending, is_last = groups.pop()
         left = _level(points, pending, neighbours, radius, sums, is_last or level >= _MAX_LEVELS)
         groups += [(group, len(group) < _FEW or len(group) == len(pending)) for group in left if len(group)]
-    raise AssertionError
+    return sums
 
 
 def _level(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from scipy import signal
@@ -193,3 +194,17 @@ def test_samples_lost_on_the_way_fail_the_gate_of_the_residual() -> None:
     clock = fit(record(emitted, 12, 0.0), np.delete(track, np.s_[lost : lost + gap]))
     assert clock.status == "ok"
     assert failed(clock) == {"clock_residual"}
+
+
+def test_samples_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "broken.mkv"
+    samples = np.zeros((1, RATE), np.float32)
+    samples[0, 300] = np.nan
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_f32le", rate=RATE, layout="mono")
+        frame = av.AudioFrame.from_ndarray(samples, format="flt", layout="mono")
+        frame.sample_rate, frame.pts = RATE, 0
+        for packet in [*stream.encode(frame), *stream.encode(None)]:
+            container.mux(packet)
+    with pytest.raises(SplashbenchError, match=r"broken\.mkv has sound samples that are no numbers"):
+        join_audio([path], [0.0], RATE, open_media)

@@ -226,6 +226,13 @@ def test_a_folder_that_is_no_cameras_invents_none(folder: Path) -> None:
     assert toml.load(folder / "session.toml")["recordings"]["pour"]["cam1"] == ["cam1/GX010003.MP4"]
 
 
+def test_links_that_lead_nowhere_are_passed_over(folder: Path) -> None:
+    write_png(folder / "sweep/IMG_0.png", scenery())
+    (folder / "sweep/notes.txt").symlink_to("/nowhere")
+    found = describe(folder, 0.03)
+    assert found.cameras == ("cam1", "cam2", "cam3")
+
+
 def checkerboard(tilt: float, shift: float) -> np.ndarray:
     """Eight by five squares in a 640x360 picture, tilted and shifted."""
     squares = (np.indices((5, 8)).sum(0) % 2 * 255).astype(np.uint8)

@@ -126,6 +126,47 @@ def test_a_camera_that_shares_no_board_is_named() -> None:
         board_poses(sightings, truth.lenses)
 
 
+def test_the_first_camera_is_named_where_it_saw_nothing() -> None:
+    truth = rig()
+    sightings = truth.sightings(np.random.default_rng(1)) | {"1": [None] * len(truth.boards)}
+    with pytest.raises(SplashbenchError, match=r"camera 1 and the others see the board"):
+        board_poses(sightings, truth.lenses)
+
+
+def test_cameras_joined_by_misread_boards_alone_are_refused() -> None:
+    truth = rig(4, 60.0, 30)
+    sightings = truth.sightings(np.random.default_rng(3))
+    for k in range(30):
+        for camera in ("1", "2") if k % 2 else ("3", "4"):
+            if k < 26:
+                sightings[camera][k] = None
+        for camera in ("3", "4"):
+            view = sightings[camera][k]
+            if k >= 26 and view is not None:
+                middle = view.pixels.mean(0)
+                view.pixels[:] = middle + (view.pixels - middle) @ np.array([[0.6, 0.4], [-0.3, 1.2]])
+    with pytest.raises(SplashbenchError, match=r"camera 3, 4 and the others see the board"):
+        board_poses(sightings, truth.lenses)
+
+
+def test_boards_that_are_all_misread_end_in_one_line() -> None:
+    truth = rig(2, 40.0, 6)
+    rng = np.random.default_rng(4)
+    sightings = truth.sightings(rng)
+    for view in (view for views in sightings.values() for view in views if view is not None):
+        if rng.random() < 0.5:
+            middle = view.pixels.mean(0)
+            view.pixels[:] = middle + (view.pixels - middle) @ rng.normal(0, 1, (2, 2)) + rng.uniform(-99, 99, 2)
+    with pytest.raises(SplashbenchError, match="fewer than 3 instants"):
+        board_poses(sightings, truth.lenses)
+
+
+def test_lenses_that_were_not_determined_leave_the_deviations_open() -> None:
+    truth = rig()
+    found = board_poses(truth.sightings(np.random.default_rng(1)), truth.lenses, {"2": np.diag([np.inf] * 9)})
+    assert found.centre_sigma == found.feature_centre_sigma == {}
+
+
 def draws(truth: Rig, covariance: np.ndarray | None, count: int = 25) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """RMS errors of the centres over repeated noise (and lenses), what was predicted, and by the corners alone; [C]."""
     rng = np.random.default_rng(6)

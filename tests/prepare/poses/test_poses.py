@@ -283,7 +283,7 @@ def test_more_of_the_sweep_is_taken_where_it_does_not_bridge_the_cameras(
         asked.append(count)
         return capture.sweep if count > 1 else []
 
-    def find(static, sweep, lenses, detector, work) -> Poses:
+    def find(static, sweep, lenses, detector, work, lens_covariance) -> Poses:
         if not sweep:
             raise SplashbenchError("no pose for camera 1")
         return replace(SOLVED, attempts=("first",))

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.gates import Gate, require, stillness_gates, stillness_limit
+from splashbench.prepare.gate import Gate, require
+from splashbench.prepare.gates import stillness_gates, stillness_limit
 from splashbench.prepare.poses.stillness import INSTANTS, Shift, Stillness, background_shift
 from splashbench.synth.imaging.lens import LensCamera
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom

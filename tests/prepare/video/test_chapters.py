@@ -29,6 +29,10 @@ GOOD = [
     {"a": facts("23:55:00:00"), "b": facts("00:05:00;02")},  # over midnight, drop frames
     {"a": facts("10:00:00:00"), "b": facts("10:00:00:00")},  # as converters write them
     {"a": facts(None, "2024-05-04T10:00:00.000000Z"), "b": facts(None, "2024-05-04T10:00:00.000000Z")},
+    {
+        "GX010003": facts(None, "2024-05-04T11:00:00Z"),
+        "GX020003": facts(None, "2024-05-04T10:00:00Z"),
+    },  # converted later
     {"a": facts("nonsense", "1904"), "b": facts(None, "yesterday")},
 ]
 
@@ -56,11 +60,16 @@ def test_what_does_not_follow_is_named(files: dict[str, VideoInfo], pattern: str
         check(**files)
 
 
+def test_a_chapter_that_was_copied_twice_is_refused() -> None:
+    with pytest.raises(SplashbenchError, match="it is chapter 1, the other 1"):
+        check_chapters([Path("card/GX010003.MP4"), Path("copy/GX010003.MP4")], [facts(), facts()])
+
+
 def test_files_with_stamps_are_refused_in_the_wrong_order(tmp_path: Path) -> None:
     """As the camera wrote them, but renamed by whoever copied them."""
     for name, timecode in (("first.mp4", "10:00:00:00"), ("second.mp4", "10:00:02:00")):
         frames = (np.full((36, 64, 3), 40 + k, np.uint8) for k in range(60))
         write_recording(tmp_path / name, frames, 30, np.zeros(96000, np.float32), timecode=timecode)
-    Recording([tmp_path / "first.mp4", tmp_path / "second.mp4"]).check()
+    assert len(Recording([tmp_path / "first.mp4", tmp_path / "second.mp4"]).headers) == 2
     with pytest.raises(SplashbenchError, match=r"first\.mp4 cannot follow second\.mp4: its timecode 10:00:00:00 is 4"):
         _ = Recording([tmp_path / "second.mp4", tmp_path / "first.mp4"]).info
