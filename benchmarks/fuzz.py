@@ -24,8 +24,10 @@ from pathlib import Path
 
 import fuzz_cases
 
+from splashbench.prepare.media.reading import end_children
+
 MAX_SECONDS, MAX_MEMORY_BYTES = 60, 6 << 30
-_BATCH = {"mesh": 1000, "submission": 200, "scene": 200}
+_BATCH = {"mesh": 1000, "media": 500, "submission": 200, "scene": 200}
 _LARGE_BATCH = 5000
 
 
@@ -48,7 +50,8 @@ def batch(kind: str, start: int, stop: int, progress: Path) -> int:
             if fault:
                 findings.append([number, fault])
         signal.alarm(0)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    end_children()
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) * 1024
     print(json.dumps({"findings": findings, "slowest_seconds": slowest, "peak_bytes": peak}))
     return 0
 

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from fuzz_media import honest_media, mutated_media
 
 from splashbench import toml
 from splashbench.errors import SplashbenchError
@@ -205,6 +206,8 @@ class Corpus:
         )
         seal(self.submission_folder, identity, record)
         self.meshes = _meshes()
+        (folder / "media").mkdir()
+        self.media = honest_media(folder / "media")
 
     def fresh(self, name: str) -> Path:
         """A copy of the folder "scene" or "submission", to be damaged."""
@@ -308,6 +311,28 @@ def _mesh(rng: random.Random, corpus: Corpus) -> str:
     return ""
 
 
+def _media(rng: random.Random, corpus: Corpus) -> str:
+    from splashbench.prepare.audio.waveform import join_audio
+    from splashbench.prepare.video.recording import Recording
+
+    name = rng.choice(list(corpus.media))
+    path = _file(corpus, name, mutated_media(rng, name, corpus.media[name], mutated))
+    recording = Recording([path])
+    for read in (
+        lambda: recording.headers[0],
+        lambda: recording.info,
+        lambda: list(recording.frames(range(0, recording.info.n_frames, 3))),
+        lambda: list(recording.luma(16, keyframes=True)),
+        lambda: join_audio([path], [0.0], 16000),
+    ):
+        try:
+            read()
+        except SplashbenchError as error:
+            if not str(error).isprintable():
+                return f"not one line: {str(error)[:200]!r}"
+    return ""
+
+
 def _command(*words: object) -> tuple[int, str]:
     from splashbench.cli.main import main
 
@@ -401,6 +426,7 @@ CASES: dict[str, Callable[[random.Random, Corpus], str]] = {
     "npz": _npz,
     "image": _image,
     "mesh": _mesh,
+    "media": _media,
     "submission": _submission,
     "scene": _scene,
 }

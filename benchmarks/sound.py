@@ -44,7 +44,6 @@ from splashbench.files import write_text
 from splashbench.prepare.audio.sync import ClockFit, estimate_sync
 from splashbench.prepare.audio.waveform import join_audio
 from splashbench.prepare.gates import sync_gates
-from splashbench.prepare.video.recording import open_media
 from splashbench.progress import track
 
 RATE = 48000
@@ -339,7 +338,7 @@ def good_real(rng: Generator, real: Path) -> Trial:
 @cache
 def real_track(folder: Path, name: str) -> Samples:
     """One of the BBC's recordings, mono at RATE."""
-    return join_audio([folder / name], [0.0], RATE, open_media).samples
+    return join_audio([folder / name], [0.0], RATE).samples
 
 
 # Trials and their table.

@@ -14,6 +14,7 @@ from splashbench.prepare.container import PlacedContainer
 from splashbench.prepare.crop import PixelBox
 from splashbench.prepare.gate import Gate
 from splashbench.prepare.masks.session_masks import MaskRecord
+from splashbench.prepare.media.container import VideoInfo
 from splashbench.prepare.poses.scale import SceneFrame
 from splashbench.prepare.poses.stillness import Stillness
 from splashbench.prepare.poses.structure_from_motion import Poses
@@ -21,7 +22,6 @@ from splashbench.prepare.scene_output import ReportPictures
 from splashbench.prepare.session import Session
 from splashbench.prepare.stage_cache import Stage, StageRecord
 from splashbench.prepare.video.motion import MotionInterval
-from splashbench.prepare.video.recording import VideoInfo
 from splashbench.prepare.video.sampling import Sampling
 from splashbench.version import __version__
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from splashbench.prepare.media.reading import end_children
 
 CASES = Path(__file__).parents[2] / "benchmarks" / "fuzz_cases.py"
 
@@ -18,13 +21,16 @@ settings.register_profile(
 
 
 @pytest.fixture(scope="session")
-def cases() -> ModuleType:
+def cases() -> Iterator[ModuleType]:
+    sys.path.insert(0, str(CASES.parent))  # where the modules are that it imports
     spec = importlib.util.spec_from_file_location("fuzz_cases", CASES)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module
+    sys.path.remove(str(CASES.parent))
+    yield module
+    end_children()
 
 
 @pytest.fixture(scope="session")

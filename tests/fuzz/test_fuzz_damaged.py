@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 # How many cases of each kind, by how long they take.
-COUNTS = {"toml": 60, "json": 60, "npz": 80, "image": 80, "mesh": 60, "submission": 20, "scene": 15}
+COUNTS = {"toml": 60, "json": 60, "npz": 80, "image": 80, "mesh": 60, "media": 60, "submission": 20, "scene": 15}
 
 
 @pytest.mark.parametrize("kind", COUNTS)

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from splashbench.prepare.audio import sync
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.audio.waveform import Seam
+from splashbench.prepare.media.container import VideoInfo
 from splashbench.prepare.session import Session
 from splashbench.prepare.stage_cache import StageStore
 from splashbench.prepare.video.pour import PourRecordings
-from splashbench.prepare.video.recording import Recording, VideoInfo
+from splashbench.prepare.video.recording import Recording
 from splashbench.progress import track
 from splashbench.scene.camera import Camera
 

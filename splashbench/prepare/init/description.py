@@ -26,7 +26,7 @@ from splashbench.progress import track
 
 _HELD_OUT_SHARE = 2 / 7  # the paper holds out two of seven cameras
 _BOARD_FRAMES = 12
-_SUBJECTS: tuple[Subject, ...] = ("pour", "static", "intrinsics")
+_SUBJECTS: tuple[Subject, ...] = ("pour", "static", "intrinsics", "extrinsics")
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,8 @@ def describe(folder: Path, square_metres: float | None = None, replace: bool = F
 
 def _with_subjects(folder: Path, recordings: list[FoundRecording]) -> list[FoundRecording]:
     """Films with what they show; those whose names do not say are looked at."""
-    unnamed = [recording for recording in recordings if recording.subject is None]
+    # A clip named for the extrinsics may show a board or the static scene.
+    unnamed = [recording for recording in recordings if recording.subject in (None, "extrinsics")]
     inspections: dict[tuple[str, ...], Inspection] = {}
     finder = MarkerFinder()
     board = next((recording for recording in recordings if recording.subject == "intrinsics"), None)
@@ -164,6 +165,16 @@ def _text(
         subject: {recording.camera: list(recording.files) for recording in recordings if recording.subject == subject}
         for subject in _SUBJECTS
     }
+    carried = files_of["extrinsics"]
+    is_placed_by_board = set(carried) >= set(cameras)
+    if not is_placed_by_board:
+        del files_of["extrinsics"]
+        if carried:
+            lacking = ", ".join(camera for camera in cameras if camera not in carried)
+            to_do.append(
+                f"the board is carried about for cameras {', '.join(carried)} but not for {lacking}: film it for all,"
+                " and add [recordings.extrinsics], or let the static scene place the cameras"
+            )
     for subject, listed in files_of.items():
         if listed:
             blocks.append(toml.dumps({"recordings": {subject: {c: listed[c] for c in cameras if c in listed}}}))
@@ -174,15 +185,22 @@ def _text(
             )
     # One that its name calls a sweep before one that merely moves, such as a film of the people at work.
     sweep = sorted((r for r in recordings if r.subject == "sweep"), key=lambda r: (r.camera != "", -_bytes(folder, r)))
-    if sweep:
-        blocks.append(toml.dumps({"sweep": {"files": list(sweep[0].files)}}))
-        if len(sweep) > 1:
-            to_do.append(f"{len(sweep)} recordings move like a sweep; check that {sweep[0].files[0]} is the right one")
+    if is_placed_by_board:
+        if sweep:
+            to_do.append(
+                f"the board places the cameras, and the sweep {sweep[0].files[0]} is not used; to have it the other"
+                " way, remove [recordings.extrinsics] and add [sweep]"
+            )
+    elif sweep:
+        blocks.append(toml.dumps({"sweep": {"files": list(sweep.pop(0).files)}}))
+        if sweep:
+            to_do.append(f"{len(sweep) + 1} recordings move like a sweep; check that the right one is listed")
     else:
         to_do.append("no handheld sweep was found; without one the cameras must share enough of the scene")
     blocks.append(toml.dumps({"masks": {"provider": "background"}}))
-    left = [recording for recording in recordings if recording.subject is None]
-    unused = [name for recording in [*left, *sweep[1:]] for name in recording.files]
+    listed_not = {None} if is_placed_by_board else {None, "extrinsics"}
+    left = [recording for recording in recordings if recording.subject in listed_not]
+    unused = [name for recording in [*left, *sweep] for name in recording.files]
     if unused:
         blocks.append("# Not used:\n" + "".join(f"#   {name}\n" for name in unused))
         to_do.append(f"{len(unused)} recordings are not used; they are listed at the end of {DESCRIPTION}")

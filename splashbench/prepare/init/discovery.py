@@ -21,7 +21,7 @@ from typing import Literal
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.video.chapters import split_name
 
-Subject = Literal["intrinsics", "static", "pour", "sweep"]
+Subject = Literal["intrinsics", "static", "extrinsics", "pour", "sweep"]
 
 _VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".360")
 _LEFT_OUT = ("truth", "prepare", "masks")  # folders that hold no recordings of the session
@@ -29,7 +29,8 @@ _PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 _MAX_FILES = 10_000
 _WORDS: dict[Subject, tuple[str, ...]] = {
     "intrinsics": ("intrinsics", "intrinsic", "calibration", "calib", "board", "charuco", "checkerboard", "lens"),
-    "static": ("static", "background", "empty", "extrinsics", "extrinsic", "poses"),
+    "static": ("static", "background", "empty", "poses"),
+    "extrinsics": ("extrinsics", "extrinsic", "placement"),
     "pour": ("pour", "pouring", "liquid", "splash", "fluid", "recording"),
     "sweep": ("sweep", "handheld", "scan", "walk"),
 }

@@ -1,13 +1,13 @@
 """What a recording shows, where its name does not say: the board waved about, a scene at rest, liquid, a sweep.
 
 A few small frames decide. A clip in which a board's markers, or a checkerboard, are seen and travel is for the lens.
-One in which nothing changes is the static scene. A camera that itself travels is the sweep. Of what is left, the
-longest is the pour.
+Of two such, the one with the larger board is, and the other places the camera. One in which nothing changes is the
+static scene. A camera that itself travels is the sweep. Of what is left, the longest is the pour.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -42,6 +42,7 @@ class Inspection:
         seconds: how long it lasts; 0 for photographs.
         marker_share: of the frames, those that show markers, or a checkerboard.
         marker_travel: how far the markers' middle wanders, image widths.
+        board_size: how far the markers reach, or the corners: mean over the frames that show them, image widths.
         change: mean change of a pixel between the first and the others, grey levels of 255.
         shift: of the whole picture from one frame to the next, median, image widths.
     """
@@ -51,6 +52,12 @@ class Inspection:
     marker_travel: float
     change: float
     shift: float
+    board_size: float = 0.0
+
+    @property
+    def is_board_carried(self) -> bool:
+        """Whether the clip is of a board that travels."""
+        return self.marker_share >= _SEEN_SHARE and self.marker_travel > _TRAVEL
 
 
 def few_frames(recording: Recording | Stills) -> list[NDArray[np.uint8]]:
@@ -67,8 +74,9 @@ def inspect_recording(paths: Sequence[Path], finder: MarkerFinder) -> Inspection
     if finder.dictionary is None:
         finder.settle(images)
     settled = finder.dictionary is not None
-    seen = [_marker_middle(finder.find(image)) if settled else _checkerboard_middle(image) for image in images]
-    middles = [middle for middle in seen if middle is not None]
+    looks = [_marker_corners(finder.find(image)) if settled else _checkerboard_corners(image) for image in images]
+    seen = [corners for corners in looks if corners is not None]
+    middles = [corners.mean(0) for corners in seen]
     travel = float(np.ptp(np.array(middles), axis=0).max()) / WIDTH if len(middles) > 1 else 0.0
     first = images[0].astype(np.float32)
     change = max((float(np.abs(image.astype(np.float32) - first).mean()) for image in images[1:]), default=0.0)
@@ -79,6 +87,7 @@ def inspect_recording(paths: Sequence[Path], finder: MarkerFinder) -> Inspection
         marker_travel=travel,
         change=change,
         shift=float(np.median(shifts)) if shifts else 0.0,
+        board_size=float(np.mean([np.ptp(corners, axis=0).max() for corners in seen])) / WIDTH if seen else 0.0,
     )
 
 
@@ -136,17 +145,15 @@ def _detect(image: NDArray[np.uint8], dictionary: str, inverted: bool) -> Marker
     )
 
 
-def _marker_middle(markers: Markers) -> NDArray[np.float64] | None:
-    """Mean place of the markers, pixels [2]; None where they are too few to be a board."""
-    if len(markers.ids) < _MIN_MARKERS:
-        return None
-    return np.asarray(markers.corners.reshape(-1, 2).mean(0), np.float64)
+def _marker_corners(markers: Markers) -> NDArray[np.float64] | None:
+    """The markers' corners, pixels [N, 2]; None where they are too few to be a board."""
+    return None if len(markers.ids) < _MIN_MARKERS else markers.corners.reshape(-1, 2).astype(np.float64)
 
 
-def _checkerboard_middle(image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
-    """Mean place of a checkerboard's corners, pixels [2]; None where there is none."""
+def _checkerboard_corners(image: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+    """A checkerboard's corners, pixels [N, 2]; None where there is none."""
     corners = board_corners(image)
-    return None if corners is None else np.asarray(corners.reshape(-1, 2).mean(0), np.float64)
+    return None if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
 def _shift(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
@@ -161,8 +168,10 @@ def assign(
 ) -> list[FoundRecording]:
     """One camera's recordings with their subjects, as far as these can be told; `inspections` by the recordings' files.
 
-    A subject that a name states stays. A subject is given to one recording at most.
+    A subject that a name states stays, with one exception: some call the static clip that of the extrinsics, so that it
+    is one unless a board is carried in it. A subject is given to one recording at most.
     """
+    recordings = [_as_seen(recording, recordings, inspections) for recording in recordings]
     taken = {recording.subject for recording in recordings if recording.subject}
     undecided = [recording for recording in recordings if recording.subject is None]
     named = [recording for recording in recordings if recording.subject is not None]
@@ -179,12 +188,35 @@ def assign(
 
     if not named and len(undecided) == 1 and inspection(undecided[0]).shift > _SWEEP_SHIFT:
         return [with_subject(undecided[0], "sweep")]
-    waved = [
-        f for f in undecided if inspection(f).marker_share >= _SEEN_SHARE and inspection(f).marker_travel > _TRAVEL
-    ]
-    take("intrinsics", sorted(waved, key=lambda f: -inspection(f).marker_share * inspection(f).marker_travel))
+    carried = [f for f in undecided if inspection(f).is_board_carried]
+    take("intrinsics", sorted(carried, key=_by_size(inspections)))
+    # Blots of liquid pass for a checkerboard now and then: the last clip that could be the pour is no board's.
+    if "pour" in taken or any(inspection(f).seconds > 0 for f in undecided if f not in carried):
+        take("extrinsics", [f for f in sorted(carried, key=_by_size(inspections)) if f in undecided])
     still = [f for f in undecided if inspection(f).change < _STILL_GREY]
     take("static", sorted(still, key=lambda f: inspection(f).change))
     # Photographs have no clock: they never show the pour.
     take("pour", sorted((f for f in undecided if inspection(f).seconds > 0), key=lambda f: -inspection(f).seconds))
     return [*named, *undecided]
+
+
+def _by_size(inspections: dict[tuple[str, ...], Inspection]) -> Callable[[FoundRecording], float]:
+    """Sorts the clips in which the board is large, often and everywhere first: they tell most of the lens."""
+
+    def key(recording: FoundRecording) -> float:
+        found = inspections[recording.files]
+        return -found.marker_share * found.marker_travel * found.board_size
+
+    return key
+
+
+def _as_seen(
+    recording: FoundRecording,
+    recordings: Sequence[FoundRecording],
+    inspections: dict[tuple[str, ...], Inspection],
+) -> FoundRecording:
+    """A clip named for the extrinsics shows the static scene where no board is carried and no other one does."""
+    if recording.subject != "extrinsics" or any(other.subject == "static" for other in recordings):
+        return recording
+    found = inspections.get(recording.files)
+    return recording if found is None or found.is_board_carried else with_subject(recording, "static")

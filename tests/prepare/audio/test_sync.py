@@ -24,7 +24,6 @@ from splashbench.prepare.audio.sync import (
     track_status,
 )
 from splashbench.prepare.audio.waveform import join_audio
-from splashbench.prepare.video.recording import open_media
 
 RATE = 48000
 LEAD = 3.0  # seconds of source signal before time 0
@@ -288,7 +287,7 @@ def tracks(*names: str) -> Audio:
     folder = Path(root, "real", "audio_bbc")
     if not folder.is_dir():
         pytest.skip(f"{folder} is not there")
-    return {name: (join_audio([folder / name], [0.0], RATE, open_media).samples, 0.0) for name in names}
+    return {name: (join_audio([folder / name], [0.0], RATE).samples, 0.0) for name in names}
 
 
 def test_real_recordings_of_speech_with_known_offsets() -> None:

@@ -14,7 +14,6 @@ from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio.sync import ClockFit, estimate_sync, require_synced
 from splashbench.prepare.audio.waveform import join_audio
 from splashbench.prepare.gates import sync_gates
-from splashbench.prepare.video.recording import open_media
 
 RATE = 48000
 LEAD = 2.0  # seconds of the source before time 0
@@ -122,7 +121,7 @@ def test_pieces_of_one_recording_that_share_no_moment_are_refused() -> None:
     path = Path(root, "real", "audio_bbc", "timbl_3.mp3") if root else None
     if path is None or not path.is_file():
         pytest.skip("SPLASHBENCH_TEST_DATA has no real/audio_bbc")
-    whole = join_audio([path], [0.0], RATE, open_media).samples
+    whole = join_audio([path], [0.0], RATE).samples
     first, second = (whole[begin : begin + 181600] for begin in (829087, 615275))
     assert fit(first, second).status in ("unconfirmed", "unrelated")
 
@@ -207,4 +206,4 @@ def test_samples_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
         for packet in [*stream.encode(frame), *stream.encode(None)]:
             container.mux(packet)
     with pytest.raises(SplashbenchError, match=r"broken\.mkv has sound samples that are no numbers"):
-        join_audio([path], [0.0], RATE, open_media)
+        join_audio([path], [0.0], RATE)

@@ -13,7 +13,6 @@ from scipy import signal
 
 from splashbench.prepare.audio.sync import ClockFit, estimate_sync, shifted, sound_paths
 from splashbench.prepare.audio.waveform import join_audio
-from splashbench.prepare.video.recording import open_media
 
 pytestmark = pytest.mark.slow
 
@@ -76,7 +75,7 @@ def through_aac(samples: np.ndarray, path: Path) -> tuple[np.ndarray, float]:
         block.sample_rate, block.pts, block.time_base = RATE, 0, Fraction(1, RATE)
         for packet in [*stream.encode(block), *stream.encode(None)]:
             out.mux(packet)
-    track = join_audio([path], [0.0], RATE, open_media)
+    track = join_audio([path], [0.0], RATE)
     path.unlink()
     return track.samples, track.start_s
 

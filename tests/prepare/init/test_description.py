@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import av
@@ -179,6 +180,54 @@ def test_a_session_is_described(folder: Path, capsys: pytest.CaptureFixture[str]
     assert "has no audio track" in capsys.readouterr().err
     assert main(["prepare", str(folder), "--init"]) == 1
     assert "exists already; edit it" in capsys.readouterr().err
+
+
+@pytest.fixture
+def with_extrinsics(folder: Path) -> Path:
+    for camera in ("cam1", "cam2", "cam3"):
+        write_clip(folder / camera / "extrinsics/GX010004.MP4", [with_board(0.2, 10.0 * k) for k in range(5)])
+    return folder
+
+
+def test_a_board_that_is_carried_for_all_cameras_places_them(with_extrinsics: Path) -> None:
+    from splashbench.prepare.session import Session
+
+    write_clip(with_extrinsics / "sweep/GX010009.MP4", [scenery()] * 4)
+    found = describe(with_extrinsics, 0.03)
+    recordings = Session.open(with_extrinsics).recordings
+    assert recordings.extrinsics == {c: [f"{c}/extrinsics/GX010004.MP4"] for c in found.cameras}
+    assert recordings.static["cam2"] == ["cam2/static/GX010002.MP4"]
+    (told,) = (line for line in found.to_do if "sweep" in line)
+    assert "the board places the cameras, and the sweep sweep/GX010009.MP4 is not used" in told
+    assert "#   sweep/GX010009.MP4" in (with_extrinsics / "session.toml").read_text()
+
+
+def test_a_board_that_is_carried_for_some_cameras_is_told(with_extrinsics: Path) -> None:
+    shutil.rmtree(with_extrinsics / "cam3/extrinsics")
+    found = describe(with_extrinsics, 0.03)
+    assert "extrinsics" not in toml.load(with_extrinsics / "session.toml")["recordings"]
+    assert any("carried about for cameras cam1, cam2 but not for cam3" in line for line in found.to_do)
+    assert "#   cam2/extrinsics/GX010004.MP4" in (with_extrinsics / "session.toml").read_text()
+
+
+def test_a_clip_named_for_the_extrinsics_without_a_board_is_the_static_one(folder: Path) -> None:
+    for camera in ("cam1", "cam2", "cam3"):
+        (folder / camera / "static").rename(folder / camera / "extrinsics")
+    describe(folder, 0.03)
+    recordings = toml.load(folder / "session.toml")["recordings"]
+    assert recordings["static"] == {c: [f"{c}/extrinsics/GX010002.MP4"] for c in ("cam1", "cam2", "cam3")}
+    assert "extrinsics" not in recordings
+
+
+def test_of_two_board_clips_without_a_name_the_closer_one_is_for_the_lens() -> None:
+    carried = {"marker_share": 0.9, "marker_travel": 0.3, "change": 20.0, "shift": 0.0}
+    inspections = {
+        ("far",): Inspection(seconds=90, board_size=0.15, **carried),
+        ("near",): Inspection(seconds=20, board_size=0.5, **carried),
+        ("pour",): Inspection(seconds=30, marker_share=0.0, marker_travel=0.0, change=9, shift=0.0),
+    }
+    shown = assign([recording(name) for name in ("far", "near", "pour")], inspections)
+    assert {f.files[0]: f.subject for f in shown} == {"near": "intrinsics", "far": "extrinsics", "pour": "pour"}
 
 
 def test_what_cannot_be_seen_is_left_to_a_person(folder: Path) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
+from splashbench.prepare.media.container import VideoInfo
 from splashbench.prepare.video.chapters import check_chapters
-from splashbench.prepare.video.recording import Recording, VideoInfo
+from splashbench.prepare.video.recording import Recording
 from splashbench.synth.recording.video import write_recording
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.video.recording import Recording, _scan, probe
+from splashbench.prepare.media.reading import probe, scan
+from splashbench.prepare.video.recording import Recording
 
 RATE = 48000
 B_FRAMES = {"bf": "3", "g": "12", "crf": "20"}
@@ -115,9 +116,9 @@ def test_frames_equal_a_sequential_decode(tmp_path: Path, codec: str, options: d
 
 def test_seeking_happens_only_into_pictures_that_need_no_past(tmp_path: Path) -> None:
     open_groups = {"bf": "3", "g": "24", "x264-params": "open-gop=1:scenecut=0"}
-    closed = _scan(write_video(tmp_path / "closed.mp4", 120, options={"bf": "3", "g": "24", "sc_threshold": "0"}))
+    closed = scan(write_video(tmp_path / "closed.mp4", 120, options={"bf": "3", "g": "24", "sc_threshold": "0"}))
     assert closed.entries.tolist() == [0, 24, 48, 72, 96]
-    assert _scan(write_video(tmp_path / "open.mp4", 120, options=open_groups)).entries.tolist() == [0]
+    assert scan(write_video(tmp_path / "open.mp4", 120, options=open_groups)).entries.tolist() == [0]
 
 
 def test_chapters_join_on_one_clock(tmp_path: Path) -> None:

@@ -1,0 +1,98 @@
+"""Messages between a process and the one that decodes for it: a head in JSON, and arrays as they lie in memory.
+
+Nothing is unpickled, and every size is checked before memory is taken for it. The other end may be a decoder that a
+hostile file has taken over.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import select
+import struct
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Of one message: its head, and all of its arrays.
+MAX_HEAD_BYTES, MAX_ARRAY_BYTES = 1 << 20, 1 << 30
+_TYPES = {name: np.dtype(name) for name in ("u1", "i8", "f4")}
+_LENGTH = struct.Struct("<I")
+
+
+class EndedError(Exception):
+    """The other end is gone, or says what no message is."""
+
+
+class SilenceError(Exception):
+    """The other end has said nothing for too long."""
+
+
+def send(descriptor: int, head: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> None:
+    """Write one message. Arrays are uint8, int64 or float32. Raises EndedError where nobody reads any more."""
+    laid_out = [np.ascontiguousarray(array) for array in arrays]
+    stated = [[f"{array.dtype.kind}{array.dtype.itemsize}", *array.shape] for array in laid_out]
+    text = json.dumps({**head, "arrays": stated}).encode("utf-8")
+    parts = [memoryview(_LENGTH.pack(len(text)) + text), *(array.data.cast("B") for array in laid_out if array.size)]
+    try:
+        for left in parts:
+            while left:
+                left = left[os.write(descriptor, left) :]
+    except BrokenPipeError:
+        raise EndedError from None
+
+
+def receive(descriptor: int, patience_s: float | None = None) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Read one message. patience_s: how long nothing may come, without end by default.
+
+    Raises EndedError at the end, or at anything that is no message, and SilenceError.
+    """
+    (length,) = _LENGTH.unpack(_bytes(descriptor, _LENGTH.size, patience_s))
+    if length > MAX_HEAD_BYTES:
+        raise EndedError
+    try:
+        head = json.loads(_bytes(descriptor, length, patience_s))
+        stated = [(_TYPES[kind], tuple(map(int, shape))) for kind, *shape in head.pop("arrays")]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise EndedError from None
+    if any(side < 0 for _, shape in stated for side in shape):
+        raise EndedError
+    if sum(kind.itemsize * math.prod(shape) for kind, shape in stated) > MAX_ARRAY_BYTES:
+        raise EndedError
+    arrays = []
+    for kind, shape in stated:
+        array = np.empty(shape, kind)
+        if array.size:
+            _fill(descriptor, array.data.cast("B"), patience_s)
+        arrays.append(array)
+    return head, arrays
+
+
+def _bytes(descriptor: int, count: int, patience_s: float | None) -> bytes:
+    content = bytearray(count)
+    _fill(descriptor, memoryview(content), patience_s)
+    return bytes(content)
+
+
+def _fill(descriptor: int, left: memoryview, patience_s: float | None) -> None:
+    """Read until `left` is full."""
+    while left:
+        if patience_s is not None:
+            _wait(descriptor, patience_s)
+        count = os.readv(descriptor, [left])
+        if count == 0:
+            raise EndedError
+        left = left[count:]
+
+
+def _wait(descriptor: int, patience_s: float) -> None:
+    until = time.monotonic() + patience_s
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    while not poll.poll(max(0.0, until - time.monotonic()) * 1000):
+        if time.monotonic() >= until:
+            raise SilenceError
