@@ -368,36 +368,77 @@ def test_a_camera_that_was_bumped_after_its_static_clip_stops_it(synthetic: Path
     assert max(still) < 0.1
 
 
-def photograph_boards(session: Path, count: int) -> None:
-    """`count` photographs by every camera of the board held up before the rig, the n-th of all cameras together."""
-    from splashbench.synth.imaging.geometry import LOOK_AT
-    from splashbench.synth.recording.board_clip import board_images
-    from splashbench.synth.recording.plan import BOARD, RecordingOptions, make_plan
+class BoardBeforeTheRig:
+    """The board held up before the rig of the synthetic session, in `count` places, tilted."""
 
-    rng = np.random.default_rng(3)
-    recorders = make_plan(RecordingOptions(fps=30, particle_radius=0.004)).recorders
-    middle = np.mean([recorder.camera.center for recorder in recorders.values()], axis=0)
-    facing = look_at(middle, LOOK_AT)[:3, :3].T  # of a print held up to the middle of the rig: x right, y down
-    boards = []
-    for _ in range(count):
+    def __init__(self, count: int) -> None:
+        from splashbench.synth.imaging.geometry import LOOK_AT
+        from splashbench.synth.recording.plan import RecordingOptions, make_plan
+
+        self.rng = np.random.default_rng(3)
+        self.recorders = make_plan(RecordingOptions(fps=30, particle_radius=0.004)).recorders
+        middle = np.mean([recorder.camera.center for recorder in self.recorders.values()], axis=0)
+        self._facing = look_at(middle, LOOK_AT)[:3, :3].T  # of a print held up to it: x right, y down
+        places = [(self.rng.normal(0, 0.35, 3), self.rng.uniform(-0.12, 0.12, 3)) for _ in range(count)]
+        self.turns, self.centres = (np.array(values) for values in zip(*places, strict=True))
+        self.centres = self.centres + LOOK_AT
+
+    def pose(self, place: float) -> np.ndarray:
+        """Board to world [4, 4] at a place, or on the way from one to the next: still about each, and smooth."""
+        from splashbench.synth.recording.plan import BOARD
+
+        k = min(int(place), len(self.turns) - 2)
+        on = np.clip((place - k - 0.2) / 0.6, 0, 1)
+        on = on * on * (3 - 2 * on)
+        turn, centre = ((1 - on) * values[k] + on * values[k + 1] for values in (self.turns, self.centres))
         board = np.eye(4)
-        board[:3, :3] = facing @ Rotation.from_rotvec(rng.normal(0, 0.35, 3)).as_matrix()
-        centre = np.array(LOOK_AT) + rng.uniform(-0.12, 0.12, 3)
+        board[:3, :3] = self._facing @ Rotation.from_rotvec(turn).as_matrix()
         board[:3, 3] = centre - board[:3, :3] @ [4 * BOARD["square_metres"], 2.5 * BOARD["square_metres"], 0]
-        boards.append(board)
-    for name, recorder in recorders.items():
-        poses = [recorder.camera.w2c @ board for board in boards]
-        noise = SensorNoise(480, 270, (1, int(name)))
-        for k, image in enumerate(board_images(recorder.camera, BOARD, poses, rng)):
-            write_png(session / f"cameras/{name}/extrinsics/{k:02d}.png", noise.expose(image))
+        return board
+
+    def photograph(self, session: Path) -> dict[str, list[str]]:
+        """A photograph of every place by every camera, the n-th of all cameras together; the recordings."""
+        from splashbench.synth.recording.board_clip import board_images
+        from splashbench.synth.recording.plan import BOARD
+
+        for name, recorder in self.recorders.items():
+            poses = [recorder.camera.w2c @ self.pose(k) for k in range(len(self.turns))]
+            noise = SensorNoise(480, 270, (1, int(name)))
+            for k, image in enumerate(board_images(recorder.camera, BOARD, poses, self.rng)):
+                write_png(session / f"cameras/{name}/extrinsics/{k:02d}.png", noise.expose(image))
+        return {name: [f"cameras/{name}/extrinsics"] for name in self.recorders}
+
+    def film(self, session: Path, seconds_a_place: float) -> dict[str, list[str]]:
+        """A video by every camera, each by its own clock and with irregular claps to be heard; the recordings."""
+        from splashbench.synth.recording.audio import Microphone, clap, record
+        from splashbench.synth.recording.board_clip import board_images
+        from splashbench.synth.recording.plan import BOARD
+
+        seconds = seconds_a_place * (len(self.turns) - 1)
+        claps = [
+            clap(np.random.default_rng((7, k)), float(at), np.array([0.3, 0.4, -0.2]))
+            for k, at in enumerate(np.sort(self.rng.uniform(0.5, seconds - 0.5, round(seconds))))
+        ]
+        for name, recorder in self.recorders.items():
+            start, rate = 0.37 * float(recorder.start_s), recorder.clock_rate
+            times = start + rate * np.arange(round((seconds - start) * 30)) / 30
+            poses = (recorder.camera.w2c @ self.pose(max(0.0, time) / seconds_a_place) for time in times)
+            noise = SensorNoise(480, 270, (2, int(name)))
+            images = board_images(recorder.camera, BOARD, list(poses), self.rng)
+            ear = Microphone(recorder.camera.center, start, rate, seed=(8, int(name)))
+            sound = record(ear, claps, len(times) / 30)
+            path = session / f"cameras/{name}/extrinsics/GX010004.MP4"
+            write_recording(path, (noise.expose(image) for image in images), 30, sound)
+        return {name: [f"cameras/{name}/extrinsics/GX010004.MP4"] for name in self.recorders}
 
 
 @pytest.mark.slow
-def test_a_board_that_all_see_places_the_cameras_without_a_sweep(synthetic: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("way", ["photographs", "videos"])
+def test_a_board_that_all_see_places_the_cameras_without_a_sweep(synthetic: Path, tmp_path: Path, way: str) -> None:
     session = Path(shutil.copytree(synthetic, tmp_path / "session"))
-    photograph_boards(session, 25)
+    board = BoardBeforeTheRig(25 if way == "photographs" else 13)
     recordings = toml.load(session / "session.toml")["recordings"]
-    recordings["extrinsics"] = {camera: [f"cameras/{camera}/extrinsics"] for camera in recordings["pour"]}
+    recordings["extrinsics"] = board.photograph(session) if way == "photographs" else board.film(session, 1.2)
     edit(session, recordings=recordings)
     with pytest.raises(SplashbenchError, match=r"places the cameras by the board; leave out that or \[sweep\]"):
         prepare(session, tmp_path / "scene")
