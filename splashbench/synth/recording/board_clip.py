@@ -60,8 +60,10 @@ def board_images(
     for pose in poses:
         # A plane's points pose @ (x, y, 0, 1) project by a homography: its inverse takes rays back to the plane.
         onto_board = rays @ np.linalg.inv(pose[:3, [0, 1, 3]]).T.astype(np.float32)
-        x, y = (onto_board[..., k] / onto_board[..., 2] + np.float32(_MARGIN_SQUARES * size) for k in (0, 1))
-        inside = (x > 0) & (x < extent[0]) & (y > 0) & (y < extent[1]) & (onto_board[..., 2] > 0)
+        ahead = onto_board[..., 2] > 0
+        depth = np.where(ahead, onto_board[..., 2], 1)  # a board on edge has rays along its plane
+        x, y = (onto_board[..., k] / depth + np.float32(_MARGIN_SQUARES * size) for k in (0, 1))
+        inside = (x > 0) & (x < extent[0]) & (y > 0) & (y < extent[1]) & ahead
         pixel_size = pose[2, 3] / camera.K[0, 0] / _SAMPLES
         texel = size / BOARD_PIXELS_PER_SQUARE
         level = levels[int(np.clip(np.floor(np.log2(max(1.0, pixel_size / texel))), 0, 2))]
