@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,12 +141,14 @@ def make_scene(
     particle_radius: float | None = None,
     step_ms: float | None = None,
     dye: str | None = None,
+    times_alone: bool = False,
     replace_existing: bool = False,
 ) -> Scene:
     """Make the scene `name` of `RECIPES` in the new folder `out`, with `timesteps` frames of `size` (width, height).
 
     `particle_radius` in metres replaces the recipe's own; `step_ms` milliseconds between all frames, its time steps;
     `dye`, a name or color as `dye_named` takes it, the liquid's. Two scenes that differ by it alone show one pour.
+    `times_alone`: scene.json tells neither scale, gravity nor the container's mesh, as of footage that nobody measured.
     Raises SplashbenchError for an unknown name, for frames that last too long, or when the liquid solver cannot run.
     """
     if name not in RECIPES:
@@ -171,6 +174,13 @@ def make_scene(
         azimuth_degrees=plan.pour.azimuth_degrees,
         particle_radius=options.particle_radius,
     )
+    known: dict[str, Any] = {
+        "metres_per_unit": 1.0,
+        "gravity": GRAVITY,
+        "container_mesh": "truth/container.ply",
+        "container_pose": np.eye(4).tolist(),
+        "container_transparent": recipe.container.transparent,
+    }
     lenses = {camera: _pinhole(plan.recorders[camera].camera) for camera in CAMERAS}
     with (
         atomic_directory(Path(out), replace=replace_existing, holds="train_meta.json") as staging,
@@ -193,11 +203,7 @@ def make_scene(
             meta=SceneMeta(
                 name=f"synthetic_{name}" + ("" if dye is None else f"_{dye.lstrip('#')}"),
                 times=(shown - shown[0]).tolist(),
-                metres_per_unit=1.0,
-                gravity=GRAVITY,
-                container_mesh="truth/container.ply",
-                container_pose=np.eye(4).tolist(),
-                container_transparent=recipe.container.transparent,
+                **({} if times_alone else known),
                 provenance={
                     "made_by": "splashbench synth scene",
                     "recipe": recipe.title,

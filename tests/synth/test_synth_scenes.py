@@ -46,6 +46,16 @@ def test_it_is_a_whole_scene(scene: Scene) -> None:
     assert np.allclose(np.diff(scene.times), 0.2)
 
 
+def test_told_the_times_alone_it_is_the_same_footage(scene: Scene, tmp_path: Path) -> None:
+    options = {"size": (120, 80), "timesteps": 4, "particle_radius": 0.0045, "step_ms": 200}
+    bare = make_scene("opaque_bowl", tmp_path / "bare", times_alone=True, **options)
+    known = (bare.metres_per_unit, bare.gravity, bare.container_mesh(), bare.container_transparent)
+    assert known == (None, None, None, None)
+    np.testing.assert_array_equal(bare.times, scene.times)
+    for place in ("ims/1/000003.png", "seg/6/000002.png", "train_meta.json"):
+        assert (bare.directory / place).read_bytes() == (scene.directory / place).read_bytes()
+
+
 def test_the_particles_lie_in_every_views_masks(scene: Scene) -> None:
     particles = scene.truth_particles()
     assert particles is not None

@@ -16,6 +16,7 @@ examples:
   splashbench synth scene opaque_bowl scenes/opaque_bowl     takes minutes: a simulated pour
   splashbench synth scene glass_tank scenes/tank --step 33 --timesteps 20
   splashbench synth scene glass_tank scenes/amber --dye amber     the same pour, of another colour
+  splashbench synth scene thin_stream scenes/stream --size 240x160 --times-alone
 
 scenes, and the time between their frames:
   balls         balls in free flight, 8 frames within a third of a second
@@ -67,6 +68,11 @@ def register(actions: argparse._SubParsersAction) -> None:
         metavar="DYE",
         help="colour of the liquid: amber, brown, green, blue, clear or '#rrggbb' (default: depends on the scene)",
     )
+    parser.add_argument(
+        "--times-alone",
+        action="store_true",
+        help="tell neither scale, gravity nor the container's mesh, as of footage that nobody measured",
+    )
     add_seed(parser, "decides poses, lenses and noise")
     add_replace(parser)
 
@@ -78,6 +84,7 @@ def make(arguments: argparse.Namespace) -> int:
             ("--step", arguments.step),
             ("--particle-radius", arguments.particle_radius),
             ("--dye", arguments.dye),
+            ("--times-alone", arguments.times_alone or None),
         ):
             if value is not None:
                 raise SplashbenchError(f"{option} is for simulated scenes, and balls is not one; leave it out")
@@ -102,6 +109,7 @@ def make(arguments: argparse.Namespace) -> int:
             particle_radius=arguments.particle_radius,
             step_ms=arguments.step,
             dye=arguments.dye,
+            times_alone=arguments.times_alone,
             replace_existing=arguments.replace,
         )
     if arguments.json:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.masks.provider import Mask
+from splashbench.prepare.video.strips import median_and_deviation
 
 Floats = NDArray[np.float32]
 
@@ -52,9 +53,7 @@ class EmptyScene:
     @classmethod
     def fit(cls, frames: Sequence[NDArray[np.uint8]]) -> EmptyScene:
         """From frames [H, W, 3] without liquid."""
-        stack = np.stack(frames)
-        median = np.median(stack, axis=0).astype(np.float32)
-        deviation = np.median(np.abs(stack - median), axis=0).mean(axis=-1)
+        median, deviation = median_and_deviation(frames)
         # The median absolute deviation of whole grey levels is coarse: neighbours share their noise.
         noise = cv2.blur((1.4826 * deviation).astype(np.float32), (9, 9))
         grey = median.mean(axis=-1)

@@ -22,6 +22,7 @@ from splashbench.prepare.poses.board_sightings import shared_sightings
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.video.recording import Recording
 from splashbench.prepare.video.stills import Stills, open_recording
+from splashbench.prepare.video.strips import median_frame
 
 Image = NDArray[np.uint8]
 
@@ -99,7 +100,7 @@ class RigRecordings:
             recording = self.static[camera]
             count = len(recording.frame_times)
             indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
-            self._static_pictures[camera] = poses.static_image([frame for _, frame in recording.frames(indices)])
+            self._static_pictures[camera] = median_frame([frame for _, frame in recording.frames(indices)])
         return self._static_pictures[camera]
 
     def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> list[Image]:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from splashbench.prepare.audio.sync import ClockFit
 from splashbench.prepare.calibration.lens import Array
 from splashbench.prepare.video.recording import Recording
+from splashbench.prepare.video.strips import median_frame
 from splashbench.progress import track
 
 Image = NDArray[np.uint8]
@@ -69,7 +70,7 @@ def background_shift(static: Image, frames: Sequence[Image]) -> Shift:
     zoom = min(1.0, MAX_WIDTH / width)
     before = _small(static, zoom)
     stack = [_small(frame, zoom) for frame in frames]
-    now = np.median(np.stack(stack), axis=0).round().astype(np.uint8)
+    now = median_frame(stack)
     old, new = _matches(before, now, _at_rest(stack))
     background = _background(old, new, (before.shape[1], before.shape[0]))
     if background is None:

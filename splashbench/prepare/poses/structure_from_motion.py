@@ -69,11 +69,6 @@ class Poses:
         return self.n_observations / max(len(self.points), 1)
 
 
-def static_image(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Median over frames [H, W, 3] of a scene in which nothing moves: the same picture with less noise."""
-    return np.median(np.stack(frames), axis=0).round().astype(np.uint8)
-
-
 def sharpest_per_bin(sharpness: Sequence[float], count: int) -> list[int]:
     """Indices of the sharpest frame in each of `count` equal bins of the sweep; all frames where there are no more."""
     n = len(sharpness)

@@ -1,11 +1,11 @@
-"""Which frames structure from motion is given: sharp ones of the sweep, and a static clip's median."""
+"""Which frames structure from motion is given: sharp ones of the sweep."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from splashbench.prepare.poses.structure_from_motion import sharpest_per_bin, sharpness_of, static_image
+from splashbench.prepare.poses.structure_from_motion import sharpest_per_bin, sharpness_of
 
 
 def test_the_sharpest_frame_of_each_bin_is_taken() -> None:
@@ -14,10 +14,3 @@ def test_the_sharpest_frame_of_each_bin_is_taken() -> None:
     rng = np.random.default_rng(2)
     sharp = rng.integers(0, 255, (60, 80)).astype(np.uint8)
     assert sharpness_of(sharp) > 2 * sharpness_of(cv2.GaussianBlur(sharp, (0, 0), 1.0))
-
-
-def test_median_of_a_static_clip_has_less_noise() -> None:
-    rng = np.random.default_rng(3)
-    scene = rng.uniform(30, 220, (40, 60, 3))
-    frames = [np.clip(scene + rng.normal(0, 4, scene.shape), 0, 255).astype(np.uint8) for _ in range(15)]
-    assert np.std(static_image(frames) - scene) < 0.5 * np.std(frames[0] - scene)
