@@ -66,7 +66,7 @@ class ClockFit:
             exactly 1 where the sound is too short to tell a drift from none.
         confidence: correlation peak over the highest at any other lag.
         residual_rms_s: RMS delay from the line of all windows with one clear peak, within 20 ms, whether they
-            support the line or not.
+            support the line or not; without those that are off by themselves.
         status: "ambiguous" where other lags match nearly as well, "unconfirmed" where too few windows agree.
         windows: (local time, delay from the line) of each of the `n_windows` that the line was fitted to, seconds.
         agreement: share of the windows, which do not overlap, that agree with the line.
@@ -272,6 +272,7 @@ def _clock(
     line = slope.delay - drift * slope.time, 1 + drift
     _, residuals = _inliers(supporting, line, np.inf)
     _, clear = _inliers([window for window in separate if window.prominence >= _CLEAR], line, np.inf)
+    clear = clear[_lasting(clear)]
     return ClockFit(
         line[0],
         line[1],
@@ -283,6 +284,15 @@ def _clock(
         drift_interval=drift_interval,
         interval_s=_SIGMAS * slope.delay_sd + drift_interval * max(abs(end - slope.time) for end in overlap),
     )
+
+
+def _lasting(residuals: Floats) -> NDArray[np.bool_]:
+    """Which of clear windows, in order of time, are on the line or as far from it as the one before or after.
+
+    Lost samples move all that follows. A window that is off by itself has caught the echo of a sound without the sound.
+    """
+    alike = np.abs(np.diff(residuals)) <= _TOLERANCE_S
+    return (np.abs(residuals) <= _TOLERANCE_S) | np.append(alike, False) | np.append(False, alike)
 
 
 def _window_seconds(overlap: float) -> float:

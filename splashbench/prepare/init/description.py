@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import write_text
+from splashbench.prepare.calibration.checkerboard import like_turns
 from splashbench.prepare.init.board_guess import BoardGuess, guess_board
 from splashbench.prepare.init.discovery import FoundRecording, Subject, cameras_of, find_recordings, strays
 from splashbench.prepare.init.inspection import Inspection, MarkerFinder, assign, few_frames, inspect_recording
 from splashbench.prepare.session import DESCRIPTION
+from splashbench.prepare.session_tables import Board
 from splashbench.prepare.video.stills import open_recording
 from splashbench.progress import track
 
@@ -166,14 +168,20 @@ def _text(
         for subject in _SUBJECTS
     }
     carried = files_of["extrinsics"]
-    is_placed_by_board = set(carried) >= set(cameras)
+    lacking = [camera for camera in cameras if camera not in carried]
+    is_ambiguous = board is not None and board.kind == "checkerboard" and _looks_alike_turned(board)
+    is_placed_by_board = not lacking and not is_ambiguous
     if not is_placed_by_board:
         del files_of["extrinsics"]
-        if carried:
-            lacking = ", ".join(camera for camera in cameras if camera not in carried)
+        if carried and lacking:
             to_do.append(
-                f"the board is carried about for cameras {', '.join(carried)} but not for {lacking}: film it for all,"
-                " and add [recordings.extrinsics], or let the static scene place the cameras"
+                f"the board is carried about for cameras {', '.join(carried)} but not for {', '.join(lacking)}: film it"
+                " for all, and add [recordings.extrinsics], or let the static scene place the cameras"
+            )
+        elif carried:
+            to_do.append(
+                "the checkerboard looks the same after a half turn, so it cannot place the cameras: film one with an"
+                " odd and an even number of squares, or let the static scene place them"
             )
     for subject, listed in files_of.items():
         if listed:
@@ -205,6 +213,11 @@ def _text(
         blocks.append("# Not used:\n" + "".join(f"#   {name}\n" for name in unused))
         to_do.append(f"{len(unused)} recordings are not used; they are listed at the end of {DESCRIPTION}")
     return "\n".join(blocks), to_do
+
+
+def _looks_alike_turned(board: BoardGuess) -> bool:
+    layout = Board(kind="checkerboard", squares_x=board.squares_x, squares_y=board.squares_y, square_metres=1.0)
+    return len(like_turns(layout)) > 1
 
 
 def _board_text(board: BoardGuess | None, square_metres: float | None) -> str:

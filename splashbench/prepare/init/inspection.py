@@ -8,7 +8,7 @@ static scene. A camera that itself travels is the sweep. Of what is left, the lo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -168,8 +168,8 @@ def assign(
 ) -> list[FoundRecording]:
     """One camera's recordings with their subjects, as far as these can be told; `inspections` by the recordings' files.
 
-    A subject that a name states stays, with one exception: some call the static clip that of the extrinsics, so that it
-    is one unless a board is carried in it. A subject is given to one recording at most.
+    A subject that a name states stays, but that of the extrinsics: many call the static clip so, and it is no other
+    unless a board is carried in it. A subject is given to one recording at most.
     """
     recordings = [_as_seen(recording, recordings, inspections) for recording in recordings]
     taken = {recording.subject for recording in recordings if recording.subject}
@@ -215,8 +215,10 @@ def _as_seen(
     recordings: Sequence[FoundRecording],
     inspections: dict[tuple[str, ...], Inspection],
 ) -> FoundRecording:
-    """A clip named for the extrinsics shows the static scene where no board is carried and no other one does."""
-    if recording.subject != "extrinsics" or any(other.subject == "static" for other in recordings):
-        return recording
+    """What a clip named for the extrinsics is of where no board is carried in it: the static scene, or nothing known
+    where another clip is of that."""
     found = inspections.get(recording.files)
-    return recording if found is None or found.is_board_carried else with_subject(recording, "static")
+    if recording.subject != "extrinsics" or found is None or found.is_board_carried:
+        return recording
+    has_static = any(other.subject == "static" for other in recordings)
+    return replace(recording, subject=None if has_static else "static")

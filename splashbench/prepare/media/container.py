@@ -17,19 +17,21 @@ from typing import Any
 # and reads no sound. Clocks and exact seeking need all of these.
 import av
 import numpy as np
+from av.stream import Disposition
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import MAX_PIXELS, require_plain_file
 
-#: Of one file: frames (nine hours of 60 a second), and hours between its first and last.
-MAX_FRAMES, MAX_HOURS = 2_000_000, 24
+#: Of one file: frames (two hours of 240 a second), hours between the first and the last; how many times as wide as high
+#: a frame may be, or as high as wide.
+MAX_FRAMES, MAX_HOURS, MAX_ASPECT = 2_000_000, 24, 32
 COPY_AGAIN = "copy it from the camera again"
 # Containers worth reading. The list keeps a stranger's "video" from being a playlist that opens other files.
 _FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mp3,wav,ogg,flac"
 _MISSING_FRAMES_TOLERATED = 2  # cameras sometimes promise one or two frames more than they write
 # Of the bytes of all packets together, in those of the file: some containers leave out what packets have in common.
-_MAX_UNPACKED = 2
+_MAX_UNPACKED = 8
 _MAX_THREADS = 9
 _MAX_LABEL = 100
 
@@ -68,6 +70,7 @@ class Chapter:
     time_base: float
     duration: float  # seconds from the first frame to the end of the last
     entries: NDArray[np.int64]  # indices of frames from which on decoding does not depend on anything earlier
+    version: str  # of the file, which may be exchanged for another one
 
 
 @contextmanager
@@ -91,11 +94,18 @@ def damaged(path: Path, reason: str) -> str:
     return f"{path} is damaged, cut short or no video ({reason}); {COPY_AGAIN}"
 
 
+def version_of(path: Path) -> str:
+    """Tells a file from the one that is there after it was exchanged or written on."""
+    facts = path.stat()
+    return f"{facts.st_ino} {facts.st_size} {facts.st_mtime_ns}"
+
+
 def video_stream(container: Any, path: Path) -> Any:
-    """The first video track. Raises SplashbenchError where there is none."""
-    if not container.streams.video:
+    """The first video track; a cover is none. Raises SplashbenchError where there is none."""
+    films = (stream for stream in container.streams.video if not stream.disposition & Disposition.attached_pic)
+    stream = next(films, None)
+    if stream is None:
         raise SplashbenchError(f"{path} has no video track; give the camera's own file")
-    stream = container.streams.video[0]
     limit_threads(stream)
     return stream
 
@@ -122,10 +132,16 @@ def packets(container: Any, stream: Any, path: Path, tick: Callable[[], None]) -
         yield packet
 
 
-def require_size(path: Path, frame: Any) -> None:
-    """Raise SplashbenchError where a frame has more pixels than any camera's."""
-    if frame.width * frame.height > MAX_PIXELS:
-        raise SplashbenchError(f"{path} has frames of {frame.width}x{frame.height}, more than {MAX_PIXELS} pixels")
+def require_sane(path: Path, frame: Any) -> None:
+    """Raise SplashbenchError where a frame is as no camera's."""
+    sides = frame.width, frame.height
+    if frame.width * frame.height > MAX_PIXELS or max(sides) > MAX_ASPECT * min(sides):
+        raise SplashbenchError(
+            f"{path} has frames of {frame.width}x{frame.height}: more than {MAX_PIXELS} pixels, or a side {MAX_ASPECT}"
+            " times the other; give the camera's own file"
+        )
+    if frame.rotation % 90:
+        raise SplashbenchError(f"{path} is to be shown turned by {frame.rotation} degrees; give the camera's own file")
 
 
 def probe(path: Path) -> VideoInfo:
@@ -144,7 +160,7 @@ def probe(path: Path) -> VideoInfo:
         frame = next(container.decode(stream), None)
         if frame is None:
             raise SplashbenchError(f"{path} holds no frame that can be decoded; {COPY_AGAIN}")
-        require_size(path, frame)
+        require_sane(path, frame)
         size = (frame.width, frame.height)
         width, height = size if frame.rotation % 180 == 0 else size[::-1]
         return VideoInfo(
@@ -176,6 +192,7 @@ def scan(path: Path, tick: Callable[[], None]) -> Chapter:
     entries: list[int] = []
     last_duration = discarded = 0
     with open_media(path) as container:
+        version = version_of(path)
         stream = video_stream(container, path)
         seconds_per_tick = float(stream.time_base)
         rate = float(stream.average_rate or 0)
@@ -207,7 +224,12 @@ def scan(path: Path, tick: Callable[[], None]) -> Chapter:
     tail = last_duration or (int(np.median(gaps)) if len(gaps) else 0)
     duration = float(ordered[-1] - ordered[0] + tail) * seconds_per_tick
     return Chapter(
-        path, ordered, seconds_per_tick, duration, np.searchsorted(ordered, np.sort(np.asarray(entries, np.int64)))
+        path,
+        ordered,
+        seconds_per_tick,
+        duration,
+        np.searchsorted(ordered, np.sort(np.asarray(entries, np.int64))),
+        version,
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
 
-from .container import COPY_AGAIN, Chapter, open_media, packets, require_size, video_stream
+from .container import COPY_AGAIN, Chapter, open_media, packets, require_sane, version_of, video_stream
 
 
 def whole(chapter: Chapter, wanted: Sequence[int], tick: Callable[[], None]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -28,7 +28,6 @@ def whole(chapter: Chapter, wanted: Sequence[int], tick: Callable[[], None]) -> 
             continue
         if frame.is_corrupt:
             break
-        require_size(chapter.path, frame)
         yield k, _upright(frame.to_ndarray(format="rgb24"), frame.rotation)
         following = next(chosen, None)
         if following is None:
@@ -42,7 +41,6 @@ def luma(
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Yield (index, luma uint8 [h, width]) of the frames first..last that decode, shrunk by area."""
     for k, frame in _decode(chapter, first, last, tick, keyframes):
-        require_size(chapter.path, frame)
         height = max(1, round(frame.height * width / frame.width))
         small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
         yield k, _upright(small.to_ndarray(), frame.rotation)
@@ -53,6 +51,8 @@ def _decode(
 ) -> Iterator[tuple[int, Any]]:
     """Yield (index, PyAV frame) for the frames first..last of one file, in order, matched by timestamp."""
     with open_media(chapter.path) as container:
+        if version_of(chapter.path) != chapter.version:
+            raise SplashbenchError(f"{chapter.path} was changed while it was read; run the command again")
         stream = video_stream(container, chapter.path)
         stream.thread_type = "AUTO"
         if keyframes:
@@ -61,7 +61,15 @@ def _decode(
         if len(before) and before[-1] > 0:
             _enter_at(container, stream, int(chapter.pts[before[-1]]))
         read = packets(container, stream, chapter.path, tick)
+        size = None
         for frame in (frame for packet in read for frame in packet.decode()):
+            require_sane(chapter.path, frame)
+            size = size or (frame.width, frame.height)
+            if (frame.width, frame.height) != size:
+                raise SplashbenchError(
+                    f"{chapter.path} changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} midway;"
+                    " give the camera's own file"
+                )
             k = int(np.searchsorted(chapter.pts, frame.pts)) if frame.pts is not None else len(chapter.pts)
             if k >= len(chapter.pts) or chapter.pts[k] != frame.pts or k < first:
                 continue

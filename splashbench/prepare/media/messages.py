@@ -32,8 +32,14 @@ class SilenceError(Exception):
     """The other end has said nothing for too long."""
 
 
-def send(descriptor: int, head: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> None:
-    """Write one message. Arrays are uint8, int64 or float32. Raises EndedError where nobody reads any more."""
+def send(
+    descriptor: int, head: dict[str, Any], arrays: Sequence[NDArray[Any]] = (), patience_s: float | None = None
+) -> None:
+    """Write one message. Arrays are uint8, int64 or float32.
+
+    patience_s: how long nobody may read, where the descriptor does not block; without end by default. Raises EndedError
+    where nobody reads any more, and SilenceError.
+    """
     laid_out = [np.ascontiguousarray(array) for array in arrays]
     stated = [[f"{array.dtype.kind}{array.dtype.itemsize}", *array.shape] for array in laid_out]
     text = json.dumps({**head, "arrays": stated}).encode("utf-8")
@@ -41,6 +47,8 @@ def send(descriptor: int, head: dict[str, Any], arrays: Sequence[NDArray[Any]] =
     try:
         for left in parts:
             while left:
+                if patience_s is not None:
+                    _wait(descriptor, select.POLLOUT, patience_s)
                 left = left[os.write(descriptor, left) :]
     except BrokenPipeError:
         raise EndedError from None
@@ -82,17 +90,17 @@ def _fill(descriptor: int, left: memoryview, patience_s: float | None) -> None:
     """Read until `left` is full."""
     while left:
         if patience_s is not None:
-            _wait(descriptor, patience_s)
+            _wait(descriptor, select.POLLIN, patience_s)
         count = os.readv(descriptor, [left])
         if count == 0:
             raise EndedError
         left = left[count:]
 
 
-def _wait(descriptor: int, patience_s: float) -> None:
+def _wait(descriptor: int, until_what: int, patience_s: float) -> None:
     until = time.monotonic() + patience_s
     poll = select.poll()
-    poll.register(descriptor, select.POLLIN)
+    poll.register(descriptor, until_what)
     while not poll.poll(max(0.0, until - time.monotonic()) * 1000):
         if time.monotonic() >= until:
             raise SilenceError

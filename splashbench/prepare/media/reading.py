@@ -14,7 +14,7 @@ import os
 import subprocess
 import threading
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,28 +23,32 @@ from numpy.typing import NDArray
 
 from splashbench.child import child_command
 from splashbench.errors import SplashbenchError
-from splashbench.files import require_plain_file
 
-from .container import Chapter, VideoInfo, damaged
+from .container import COPY_AGAIN, Chapter, VideoInfo, damaged
 from .messages import EndedError, SilenceError, receive, send
 from .worker import MAX_MEMORY_BYTES, serve
 
-#: How long a child may work on a file without a sign of life.
-PATIENCE_S = 45.0
+#: How long a child may work on a file without a sign of life, and how long it may take to start.
+PATIENCE_S, START_S = 45.0, 120.0
 _PIPE_BYTES = 1 << 20
 _END_SECONDS = 5.0
+_MAX_FAULT = 1000
+
+Answer = tuple[dict[str, Any], list[NDArray[Any]]]
 
 
 def probe(path: Path) -> VideoInfo:
     """Read a file's headers and its first frame. Raises SplashbenchError when it is unreadable or holds no video."""
-    ((head, _),) = _asked({"task": "probe", "path": str(path)})
-    return VideoInfo(**head)
+    with _as_it_should_be(path):
+        ((head, _),) = _asked({"task": "probe", "path": str(path)})
+        return VideoInfo(**head)
 
 
 def scan(path: Path) -> Chapter:
     """Read the packets of a file without decoding them. Raises SplashbenchError when fewer are there than promised."""
-    ((head, (pts, entries)),) = _asked({"task": "scan", "path": str(path)})
-    return Chapter(Path(path), pts, head["time_base"], head["duration"], entries)
+    with _as_it_should_be(path):
+        ((head, (pts, entries)),) = _asked({"task": "scan", "path": str(path)})
+        return Chapter(Path(path), pts, head["time_base"], head["duration"], entries, head["version"])
 
 
 def frames(chapter: Chapter, wanted: Sequence[int] | NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -54,8 +58,7 @@ def frames(chapter: Chapter, wanted: Sequence[int] | NDArray[np.int64]) -> Itera
     pictures that the coding standards make independent of the past. Raises SplashbenchError when a frame
     cannot be decoded.
     """
-    numbers = np.asarray(wanted, np.int64)
-    return _images(chapter, {"task": "frames"}, [numbers])
+    return _images(chapter, {"task": "frames"}, [np.asarray(wanted, np.int64)])
 
 
 def luma(
@@ -68,49 +71,71 @@ def luma(
 def sound(path: Path) -> list[tuple[float, int, NDArray[np.float32]]]:
     """A file's first sound track: contiguous pieces of (first sample in the file's own time, rate, mono samples)."""
     pieces: list[tuple[float, int, list[NDArray[np.float32]]]] = []
-    with closing(_asked({"task": "sound", "path": str(path)})) as blocks:
+    with closing(_asked({"task": "sound", "path": str(path)})) as blocks, _as_it_should_be(path):
         for head, (samples,) in blocks:
             if head["time"] is not None:
-                pieces.append((head["time"], head["rate"], []))
+                pieces.append((float(head["time"]), int(head["rate"]), []))
             pieces[-1][2].append(samples)
     if not pieces:
-        raise SplashbenchError(f"{path} has an audio track without a single sample; copy it from the camera again")
+        raise SplashbenchError(f"{path} has an audio track without a single sample; {COPY_AGAIN}")
     return [(time, rate, np.concatenate(samples)) for time, rate, samples in pieces]
 
 
 def _images(
     chapter: Chapter, request: dict[str, Any], more: Sequence[NDArray[Any]]
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    request |= {"path": str(chapter.path), "time_base": chapter.time_base, "duration": chapter.duration}
-    with closing(_asked(request, [chapter.pts, chapter.entries, *more])) as answers:
-        for head, (image,) in answers:
-            yield head["k"], image
+    facts = {"time_base": chapter.time_base, "duration": chapter.duration, "version": chapter.version}
+    asked = _asked({"path": str(chapter.path), **facts, **request}, [chapter.pts, chapter.entries, *more])
+    with closing(asked) as answers:
+        for answer in answers:
+            with _as_it_should_be(chapter.path):
+                head, (image,) = answer
+                k = int(head["k"])
+            yield k, image
 
 
-def _asked(request: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> Generator[tuple[dict[str, Any], list[Any]]]:
+@contextmanager
+def _as_it_should_be(path: Path) -> Iterator[None]:
+    """Tell where a child's answer is none to what it was asked: a file has taken it over."""
+    try:
+        yield
+    except (TypeError, ValueError, KeyError, IndexError):
+        _children.end()
+        raise SplashbenchError(damaged(path, "the decoder says what makes no sense")) from None
+
+
+def _asked(request: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> Generator[Answer]:
     """Yield the answers of a child to `request`. Raises SplashbenchError with what is wrong with the file."""
     path = Path(request["path"])
-    require_plain_file(path)
-    child = _children.take()
-    is_free = False
-    try:
-        send(child.requests, request, arrays)
-        while True:
-            head, found = receive(child.answers, PATIENCE_S)
-            if "done" in head:
-                is_free = True
-                return
-            if "fault" in head:
-                is_free = "worn" not in head  # what was in want of memory may not have given it back
-                raise SplashbenchError(str(head["fault"]))
-            if "tick" not in head:
-                yield head, found
-    except SilenceError:
-        raise SplashbenchError(damaged(path, f"nothing came of it for {PATIENCE_S:.0f} s")) from None
-    except EndedError:
-        raise SplashbenchError(damaged(path, child.how_it_ended())) from None
-    finally:
-        _children.give_back(child, is_free)
+    if not path.is_absolute():
+        request |= {"folder": str(Path.cwd())}  # a child stays where it was started
+    while True:
+        child, is_free = _children.take(path), False
+        is_kept = child.is_ready  # from a file before
+        has_answered = False
+        try:
+            if not child.is_ready:
+                child.start(path)
+            send(child.requests, request, arrays, PATIENCE_S)
+            while True:
+                head, found = receive(child.answers, PATIENCE_S)
+                has_answered = True
+                if "done" in head:
+                    is_free = True
+                    return
+                if "fault" in head:
+                    is_free = "worn" not in head  # what was in want of memory may not have given it back
+                    raise SplashbenchError(" ".join(str(head["fault"]).split("\n"))[:_MAX_FAULT])
+                if "tick" not in head:
+                    yield head, found
+        except SilenceError:
+            raise SplashbenchError(damaged(path, f"nothing came of it for {PATIENCE_S:.0f} s")) from None
+        except EndedError:
+            if is_kept and not has_answered:
+                continue  # it may have been killed while it waited: not this file's doing
+            raise SplashbenchError(damaged(path, child.how_it_ended())) from None
+        finally:
+            _children.give_back(child, is_free)
 
 
 class _Child:
@@ -130,7 +155,20 @@ class _Child:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self.requests, self.answers = self._process.stdin.fileno(), self._process.stdout.fileno()
+        os.set_blocking(self.requests, False)
         _enlarge(self.answers)
+        self.is_ready = False
+
+    def start(self, path: Path) -> None:
+        """Wait until it can be asked. Raises SplashbenchError naming `path`, whose fault it is not."""
+        try:
+            receive(self.answers, START_S)
+        except (EndedError, SilenceError):
+            raise SplashbenchError(
+                f"{path} was not read: the process that decodes did not start ({self.how_it_ended()}); free some"
+                " memory, or raise the limits of this shell (ulimit -v)"
+            ) from None
+        self.is_ready = True
 
     def is_alive(self) -> bool:
         return self._process.poll() is None
@@ -144,6 +182,14 @@ class _Child:
     def end(self) -> None:
         self._process.kill()
         self._process.wait()
+        self._close()
+
+    def forget(self) -> None:
+        """Leave it to the process that has started it, which this one was forked off."""
+        self._process.returncode = 0  # else the garbage collector warns that it still runs
+        self._close()
+
+    def _close(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
@@ -157,40 +203,48 @@ def _enlarge(descriptor: int) -> None:
         fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
 
-class _Children(threading.local):
-    """Children of this thread that wait for a file: they end with the thread that started them."""
+class _Children:
+    """The child that waits for a file. A process that is forked off has none of its parent's."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._idle: list[_Child] = []
-        self._owner = os.getpid()
 
-    def take(self) -> _Child:
-        if self._owner != os.getpid():  # forked off: they are the parent's
-            self._idle, self._owner = [], os.getpid()
-        while self._idle:
-            child = self._idle.pop()
-            if child.is_alive():
-                return child
-        return _Child()
+    def take(self, path: Path) -> _Child:
+        with self._lock:
+            while self._idle:
+                child = self._idle.pop()
+                if child.is_alive():
+                    return child
+                child.end()
+        try:
+            return _Child()
+        except OSError as error:
+            raise SplashbenchError(
+                f"{path} was not read: no process could be started ({error.strerror}); close other programs, or raise"
+                " the limits of this shell (ulimit -n, ulimit -u)"
+            ) from None
 
     def give_back(self, child: _Child, is_free: bool) -> None:
-        if is_free and not self._idle:
-            self._idle.append(child)
-        else:  # what it still has to say is nobody's
-            child.end()
+        with self._lock:
+            if is_free and not self._idle:
+                self._idle.append(child)
+                return
+        child.end()  # what it still has to say is nobody's
 
     def end(self) -> None:
-        if self._owner == os.getpid():
-            while self._idle:
-                self._idle.pop().end()
+        with self._lock:
+            idle, self._idle = self._idle, []
+        for child in idle:
+            child.end()
+
+    def forget(self) -> None:
+        idle, self._idle, self._lock = self._idle, [], threading.Lock()
+        for child in idle:
+            child.forget()
 
 
 _children = _Children()
-
-
-def end_children() -> None:
-    """End the children of this thread that wait for a file."""
-    _children.end()
-
-
+end_children = _children.end
 atexit.register(end_children)
+os.register_at_fork(after_in_child=_children.forget)

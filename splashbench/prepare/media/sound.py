@@ -18,8 +18,8 @@ from .container import COPY_AGAIN, limit_threads, open_media, packets
 
 Samples = NDArray[np.float32]
 
-#: Of one file: samples (two hours of 48,000 a second), and what their number a second lies between.
-MAX_SAMPLES, MIN_RATE, MAX_RATE = 2 * 3600 * 48_000, 1000, 384_000
+#: Of one recording, seconds; of one file, pieces that do not follow each other, and what samples a second lie between.
+MAX_SECONDS, MAX_PIECES, MIN_RATE, MAX_RATE = 2 * 3600, 1000, 1000, 384_000
 # Timestamps of some containers are whole milliseconds; below this, samples are taken to follow each other.
 JITTER_S = 0.003
 # Samples that are handed over at once.
@@ -32,7 +32,7 @@ def pieces(path: Path, tick: Callable[[], None]) -> Iterator[tuple[float | None,
     The time is None where a block follows the one before it. tick: is called with everything that is decoded. Raises
     SplashbenchError without a sound track.
     """
-    native, count = 0, 0
+    native = count = n_pieces = 0
     end = 0.0
     begins: float | None = None
     blocks: list[Samples] = []
@@ -52,10 +52,8 @@ def pieces(path: Path, tick: Callable[[], None]) -> Iterator[tuple[float | None,
             if not MIN_RATE <= native <= MAX_RATE:
                 raise SplashbenchError(f"{path} has {native} sound samples a second, which no camera has; {COPY_AGAIN}")
             count += frame.samples
-            if count > MAX_SAMPLES:
-                raise SplashbenchError(
-                    f"{path} has more than {MAX_SAMPLES} sound samples; cut the recording to the pour"
-                )
+            if count > MAX_SECONDS * native:
+                raise SplashbenchError(f"{path} has more than {MAX_SECONDS // 3600} hours of sound; cut it to the pour")
             time = end if frame.pts is None else float(frame.pts * frame.time_base)
             is_apart = not count - frame.samples or abs(time - end) > JITTER_S
             if blocks and (is_apart or sum(map(len, blocks)) >= _BLOCK):
@@ -63,6 +61,9 @@ def pieces(path: Path, tick: Callable[[], None]) -> Iterator[tuple[float | None,
                 begins, blocks = None, []
             if is_apart:
                 begins = end = time
+                n_pieces += 1
+                if n_pieces > MAX_PIECES:
+                    raise SplashbenchError(f"{path} has sound in more than {MAX_PIECES} pieces; {COPY_AGAIN}")
             blocks.append(_mono(frame))
             end += frame.samples / native
         if blocks:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -16,6 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.processes import outlive_parent
 
 from . import container, frames, sound
 from .messages import EndedError, receive, send
@@ -24,6 +27,7 @@ from .messages import EndedError, receive, send
 MAX_MEMORY_BYTES = 4 << 30
 # A sign of life, at most so often.
 _TICK_SECONDS = 5.0
+_PARENT_SECONDS = 0.5
 _MAX_FAULT = 300
 
 Answer = tuple[dict[str, Any], list[NDArray[Any]]]
@@ -35,14 +39,27 @@ def serve(max_memory_bytes: str) -> int:
     with Path(os.devnull).open("r+b") as nothing:
         os.dup2(nothing.fileno(), 0)
         os.dup2(nothing.fileno(), 1)  # whatever FFmpeg prints is no answer
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a group; whoever asks decides
+    outlive_parent()  # the end of a thread counts as its process's, and one may ask that another has begun with
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    limit = int(max_memory_bytes) if most == resource.RLIM_INFINITY else min(int(max_memory_bytes), most)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (int(max_memory_bytes), int(max_memory_bytes)))
-    while True:
-        try:
+    try:
+        send(answers, {"ready": True})
+        while True:
             request, arrays = receive(requests)
             answer(request, arrays, answers)
-        except EndedError:
-            return 0
+    except EndedError:
+        return 0
+
+
+def _end_with(parent: int) -> None:
+    """End this process with `parent`, whatever a decoder does."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_SECONDS)
+    os._exit(1)
 
 
 def answer(request: dict[str, Any], arrays: list[NDArray[Any]], out: int) -> None:
@@ -50,6 +67,8 @@ def answer(request: dict[str, Any], arrays: list[NDArray[Any]], out: int) -> Non
     tick = _Ticks(out)
     path = Path(request["path"])
     try:
+        if request.get("folder"):
+            os.chdir(request["folder"])
         for head, found in _answers(request, arrays, tick):
             send(out, head, found)
             tick.heard()
@@ -58,7 +77,8 @@ def answer(request: dict[str, Any], arrays: list[NDArray[Any]], out: int) -> Non
         send(out, {"fault": str(error)})
     except MemoryError:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0] >> 20
-        send(out, {"fault": container.damaged(path, f"it needs more than {limit} MiB of memory"), "worn": True})
+        reason = f"FFmpeg wants more than {limit} MiB of memory for it, or more tracks than it can have"
+        send(out, {"fault": container.damaged(path, reason), "worn": True})
     except EndedError:
         raise
     # PyAV fails in any way that Python knows over what FFmpeg hands it from a damaged file.
@@ -73,13 +93,14 @@ def _answers(request: dict[str, Any], arrays: list[NDArray[Any]], tick: _Ticks) 
         yield asdict(container.probe(path)), []
     elif task == "scan":
         found = container.scan(path, tick)
-        yield {"time_base": found.time_base, "duration": found.duration}, [found.pts, found.entries]
+        stated = {"time_base": found.time_base, "duration": found.duration, "version": found.version}
+        yield stated, [found.pts, found.entries]
     elif task == "sound":
         for time_s, rate, samples in sound.pieces(path, tick):
             yield {"time": time_s, "rate": rate}, [samples]
     else:
         pts, entries, *wanted = arrays
-        chapter = container.Chapter(path, pts, request["time_base"], request["duration"], entries)
+        chapter = container.Chapter(path, pts, request["time_base"], request["duration"], entries, request["version"])
         if task == "frames":
             images = frames.whole(chapter, wanted[0].tolist(), tick)
         else:

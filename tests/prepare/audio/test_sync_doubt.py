@@ -195,6 +195,18 @@ def test_samples_lost_on_the_way_fail_the_gate_of_the_residual() -> None:
     assert failed(clock) == {"clock_residual"}
 
 
+def test_an_echo_that_a_window_catches_alone_fails_nothing() -> None:
+    """A wall 3 m away: claps whose window ends before their echo comes."""
+    rng = np.random.default_rng(13)
+    emitted = emit(7, *((float(at), clap(rng)) for at in np.arange(0.7, 6.4, 0.31)), (2.5, noise(rng, 2)))
+    heard = record(emitted, 6, 0.2, seed=1)
+    late = round(0.018 * RATE)
+    heard[late:] += 0.5 * heard[:-late]
+    clock = fit(record(emitted, 6, 0.0), heard)
+    assert clock.status == "ok"
+    assert failed(clock) <= {"direct_sound"}
+
+
 def test_samples_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "broken.mkv"
     samples = np.zeros((1, RATE), np.float32)

@@ -210,6 +210,29 @@ def test_a_board_that_is_carried_for_some_cameras_is_told(with_extrinsics: Path)
     assert "#   cam2/extrinsics/GX010004.MP4" in (with_extrinsics / "session.toml").read_text()
 
 
+def test_a_checkerboard_that_looks_alike_after_a_half_turn_places_nothing(tmp_path: Path) -> None:
+    from splashbench.prepare.session import Session
+
+    session = tmp_path / "monday"
+    for camera in ("cam1", "cam2"):
+        for k in range(6):
+            board = checkerboard(0.1 * k, 12.0 * k, squares=(8, 6))
+            for kind in ("intrinsics", "extrinsics"):
+                write_png(session / camera / f"{kind}/IMG_{k}.png", board)
+            write_png(session / camera / f"static/IMG_{k}.png", scenery(640, 360))
+        write_clip(session / camera / "pour/GX010003.MP4", [scenery(640, 360, seed=k) for k in range(6)])
+    found = describe(session, 0.03)
+    assert Session.open(session).recordings.extrinsics == {}
+    assert any("looks the same after a half turn" in line for line in found.to_do)
+
+
+def test_a_second_clip_of_a_still_scene_that_is_named_for_the_extrinsics_is_not_used() -> None:
+    rest = {"seconds": 5.0, "marker_share": 0.0, "marker_travel": 0.0, "change": 0.5, "shift": 0.0}
+    shown = assign([recording("a", "static"), recording("b", "extrinsics")], {("b",): Inspection(**rest)})
+    assert {f.files[0]: f.subject for f in shown}["a"] == "static"
+    assert "extrinsics" not in {f.subject for f in shown}
+
+
 def test_a_clip_named_for_the_extrinsics_without_a_board_is_the_static_one(folder: Path) -> None:
     for camera in ("cam1", "cam2", "cam3"):
         (folder / camera / "static").rename(folder / camera / "extrinsics")
@@ -282,10 +305,10 @@ def test_links_that_lead_nowhere_are_passed_over(folder: Path) -> None:
     assert found.cameras == ("cam1", "cam2", "cam3")
 
 
-def checkerboard(tilt: float, shift: float) -> np.ndarray:
-    """Eight by five squares in a 640x360 picture, tilted and shifted."""
-    squares = (np.indices((5, 8)).sum(0) % 2 * 255).astype(np.uint8)
-    print_ = cv2.copyMakeBorder(squares.repeat(60, 0).repeat(60, 1), 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+def checkerboard(tilt: float, shift: float, squares: tuple[int, int] = (8, 5)) -> np.ndarray:
+    """A board in a 640x360 picture, tilted and shifted."""
+    cells = (np.indices(squares[::-1]).sum(0) % 2 * 255).astype(np.uint8)
+    print_ = cv2.copyMakeBorder(cells.repeat(60, 0).repeat(60, 1), 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
     height, width = print_.shape
     corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
     seen = np.float32([[100, 60], [470, 60 + 40 * tilt], [470, 300 - 40 * tilt], [100, 300]]) + np.float32([shift, 0])

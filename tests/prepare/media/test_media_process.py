@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +18,8 @@ import av
 import numpy as np
 import psutil
 import pytest
+from av.stream import Disposition
+from PIL import Image
 
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.audio.waveform import join_audio
@@ -62,6 +67,7 @@ def decoders() -> list[psutil.Process]:
         ("dies", "the decoder ended with -11"),
         ("babbles", "the decoder broke off"),
         ("boasts", "the decoder broke off"),
+        ("lies", "the decoder says what makes no sense"),
     ],
 )
 def test_a_decoder_that_a_file_breaks(film: Path, name: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,6 +80,93 @@ def test_a_decoder_that_a_file_breaks(film: Path, name: str, said: str, monkeypa
             reading.probe(film)
     assert not [each for each in psutil.Process().children() if "bad_decoders" in " ".join(each.cmdline())]
     assert reading.probe(film).n_frames == 9
+
+
+def test_a_decoder_that_does_not_start_is_not_the_files_fault(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as within:
+        within.syspath_prepend(Path(__file__).parent)
+        within.setattr(reading, "serve", import_module("bad_decoders").fails)
+        with pytest.raises(
+            SplashbenchError, match=r"film\.mp4 was not read: .* did not start \(the decoder ended with 3\)"
+        ):
+            reading.probe(film)
+
+    def no_more(*arguments: object, **options: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    with monkeypatch.context() as within:
+        within.setattr(subprocess, "Popen", no_more)
+        with pytest.raises(SplashbenchError, match=r"film\.mp4 was not read: .*\(Too many open files\); close other"):
+            reading.probe(film)
+    assert reading.probe(film).n_frames == 9
+
+
+def test_a_child_that_was_killed_while_it_waited_costs_nothing(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reading.probe(film)
+    (child,) = decoders()
+    monkeypatch.setattr(reading._Child, "is_alive", lambda self: True)  # it is killed just after it was looked at
+    child.kill()
+    child.wait()
+    assert reading.probe(film).n_frames == 9
+    assert [other.pid for other in decoders()] != [child.pid]
+
+
+def test_a_child_that_does_not_listen_is_given_up(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chapter = reading.scan(film)
+    long = replace(chapter, pts=np.arange(200_000, dtype=np.int64))  # more than a pipe holds
+    (child,) = decoders()
+    child.suspend()
+    monkeypatch.setattr(reading, "PATIENCE_S", 0.4)
+    with pytest.raises(SplashbenchError, match="nothing came of it"):
+        list(reading.frames(long, [0]))
+
+
+def test_a_file_is_looked_for_where_this_process_is(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "other").mkdir()
+    write_film(tmp_path / "other" / "film.mp4", 5)
+    for folder, count in ((tmp_path, 9), (tmp_path / "other", 5)):
+        monkeypatch.chdir(folder)
+        assert reading.probe(Path("film.mp4")).n_frames == count
+    monkeypatch.chdir("/")
+    with pytest.raises(SplashbenchError, match=r"film\.mp4 does not exist"):
+        reading.probe(Path("film.mp4"))
+
+
+def test_a_file_that_was_exchanged_is_not_read_on(film: Path, tmp_path: Path) -> None:
+    recording = Recording([film])
+    assert len(list(recording.frames([0, 3]))) == 2
+    write_film(film, 20)
+    with pytest.raises(SplashbenchError, match=r"film\.mp4 was changed while it was read; run the command again"):
+        list(recording.frames([0, 3]))
+
+
+def test_a_child_serves_whatever_thread_asks_and_no_process_that_is_forked_off(film: Path) -> None:
+    begun: list[Iterator[tuple[int, np.ndarray]]] = []
+
+    def begin() -> None:
+        frames = Recording([film]).frames()
+        next(frames)
+        begun.append(frames)
+
+    thread = threading.Thread(target=begin)
+    thread.start()
+    thread.join()
+    time.sleep(0.7)
+    assert len(list(begun[0])) == 8
+    code = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from splashbench.prepare.media import reading\n"
+        "reading.probe(Path(sys.argv[1]))\n"
+        "process = os.fork()\n"
+        "print(reading.probe(Path(sys.argv[1])).n_frames, flush=True)\n"
+        "if process:\n"
+        "    sys.exit(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]))\n"
+    )
+    said = subprocess.run([sys.executable, "-W", "error", "-c", code, film], capture_output=True, text=True, check=True)
+    assert (said.stdout, said.stderr) == ("9\n9\n", "")
 
 
 def test_memory_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +198,7 @@ def test_want_of_memory_is_told_as_such(film: Path, monkeypatch: pytest.MonkeyPa
     out, into = os.pipe()
     worker.answer({"task": "probe", "path": str(film)}, [], into)
     (head, _) = messages.receive(out)
-    assert head["fault"].startswith(f"{film} is damaged, cut short or no video (it needs more than ")
+    assert head["fault"].startswith(f"{film} is damaged, cut short or no video (FFmpeg wants more than ")
     assert head["worn"]
     os.close(out)
     os.close(into)
@@ -169,6 +262,83 @@ def test_labels_that_are_no_text_are_left_out(tmp_path: Path) -> None:
     assert reading.probe(path).timecode is None
 
 
+@pytest.mark.parametrize("size", [(640, 16), (16, 640)])
+def test_frames_as_no_camera_has_them_are_refused(size: tuple[int, int], tmp_path: Path) -> None:
+    path = write_film(tmp_path / "odd.mp4", 3, size)
+    for read in (lambda: reading.probe(path), lambda: list(Recording([path]).luma(320))):
+        with pytest.raises(SplashbenchError, match=r"odd\.mp4 has frames of \d+x\d+: .*; give the camera's own file"):
+            read()
+
+
+def test_frames_that_change_their_size_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "sizes.mkv"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for number in range(6):
+            encoder = av.CodecContext.create("mjpeg", "w")
+            encoder.width, encoder.height = (64, 48) if number < 3 else (128, 96)
+            encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1, 30)
+            pixels = np.zeros((encoder.height, encoder.width, 3), np.uint8)
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuvj420p")
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            for packet in [*encoder.encode(frame), *encoder.encode(None)]:
+                packet.pts = packet.dts = number
+                packet.time_base, packet.stream = Fraction(1, 30), stream
+                out.mux(packet)
+    with pytest.raises(SplashbenchError, match=r"sizes\.mkv changes from 64x48 to 128x96 midway"):
+        list(Recording([path]).frames())
+
+
+def write_sound(path: Path, rate: int, seconds: float, codec: str) -> Path:
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream(codec, rate=rate, layout="mono")
+        for start in range(0, round(rate * seconds), 1 << 16):
+            samples = np.zeros((1, min(1 << 16, round(rate * seconds) - start)), np.int16)
+            block = av.AudioFrame.from_ndarray(samples, "s16", "mono")
+            block.sample_rate, block.pts = rate, start
+            out.mux(stream.encode(block))
+        out.mux(stream.encode(None))
+    return path
+
+
+def test_hours_of_silence_in_a_small_file_are_refused(tmp_path: Path) -> None:
+    path = write_sound(tmp_path / "slow.flac", 1000, 3 * 3600, "flac")
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(SplashbenchError, match=r"slow\.flac has more than 2 hours of sound; cut it to the pour"):
+        join_audio([path], [0.0], 48000)
+
+
+def test_rates_that_no_camera_has_are_refused(tmp_path: Path) -> None:
+    """To resample from them takes filters of a million taps, for each piece of sound."""
+    path = write_sound(tmp_path / "prime.mkv", 47999, 0.2, "pcm_s16le")
+    with pytest.raises(SplashbenchError, match=r"prime\.mkv has 47999 sound samples a second, which no camera has"):
+        join_audio([path], [0.0], 48000)
+    for rate in (8000, 11025, 22050, 44100, 96000):
+        track = join_audio([write_sound(tmp_path / f"{rate}.mkv", rate, 0.5, "pcm_s16le")], [0.0], 48000)
+        assert len(track.samples) == -(-round(rate / 2) * 48000 // rate)
+
+
+def test_a_cover_is_no_film(tmp_path: Path) -> None:
+    path = tmp_path / "cover.mp3"
+    picture = io.BytesIO()
+    Image.new("RGB", (32, 32)).save(picture, "PNG")
+    with av.open(str(path), "w") as out:
+        sound = out.add_stream("mp3", rate=48000, layout="mono")
+        cover = out.add_stream("png", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 32, 32, "rgb24"
+        cover.disposition = Disposition.attached_pic
+        packet = av.Packet(picture.getvalue())
+        packet.stream, packet.pts, packet.dts = cover, 0, 0
+        out.mux(packet)
+        block = av.AudioFrame.from_ndarray(np.zeros((1, 4800), np.float32), "fltp", "mono")
+        block.sample_rate, block.pts = 48000, 0
+        for part in [*sound.encode(block), *sound.encode(None)]:
+            out.mux(part)
+    with pytest.raises(SplashbenchError, match=r"cover\.mp3 has no video track"):
+        reading.probe(path)
+
+
 def test_sound_of_days_is_refused_before_memory_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.wav"
     with av.open(str(path), "w") as out:
@@ -177,7 +347,7 @@ def test_sound_of_days_is_refused_before_memory_is_taken(tmp_path: Path, monkeyp
         block.sample_rate, block.pts = 8000, 0
         out.mux(stream.encode(block))
     assert len(join_audio([path], [0.0], 8000).samples) == 800
-    with pytest.raises(SplashbenchError, match=r"a\.wav and what follows it have 24\.0 hours of sound, more than 4"):
+    with pytest.raises(SplashbenchError, match=r"a\.wav and what follows it have 24\.0 hours of sound, more than 2"):
         join_audio([path, path], [0.0, 86400.0], 8000)
 
 
