@@ -52,6 +52,7 @@ _TOLERANCE_S = 4e-4  # windows this close to the common line support it
 # What must agree with a clock: windows (of neighbours, every second one), a share of all, from first to last.
 MIN_AGREEING, MIN_AGREEMENT, MIN_SPREAD_S = 3, 0.1, 1.0
 _AUDIBLE, _CLEAR = 1.2, 2.0  # a window's peak over the next one: hardly chance, and no chance
+_ECHO_CLARITY = 3.0  # how many times as clear as an echo caught alone the usual window is, at the least
 _BLOCK = 4096  # samples per transform
 _REACH_S = 0.02  # windows may lie this far from the line
 _SIGMAS = 2.0  # of a stated interval, 95 %
@@ -66,7 +67,7 @@ class ClockFit:
             exactly 1 where the sound is too short to tell a drift from none.
         confidence: correlation peak over the highest at any other lag.
         residual_rms_s: RMS delay from the line of all windows with one clear peak, within 20 ms, whether they
-            support the line or not; without those that are off by themselves.
+            support the line or not; without those that have caught an echo alone.
         status: "ambiguous" where other lags match nearly as well, "unconfirmed" where too few windows agree.
         windows: (local time, delay from the line) of each of the `n_windows` that the line was fitted to, seconds.
         agreement: share of the windows, which do not overlap, that agree with the line.
@@ -271,8 +272,9 @@ def _clock(
     drift_interval = float(_SIGMAS * left + abs((slope.drift if earned else shrunk) - drift))
     line = slope.delay - drift * slope.time, 1 + drift
     _, residuals = _inliers(supporting, line, np.inf)
-    _, clear = _inliers([window for window in separate if window.prominence >= _CLEAR], line, np.inf)
-    clear = clear[_lasting(clear)]
+    distinct = [window for window in separate if window.prominence >= _CLEAR]
+    _, clear = _inliers(distinct, line, np.inf)
+    clear = clear[_lasting(clear, np.array([window.prominence for window in distinct]))]
     return ClockFit(
         line[0],
         line[1],
@@ -286,13 +288,17 @@ def _clock(
     )
 
 
-def _lasting(residuals: Floats) -> NDArray[np.bool_]:
-    """Which of clear windows, in order of time, are on the line or as far from it as the one before or after.
+def _lasting(residuals: Floats, prominences: Floats) -> NDArray[np.bool_]:
+    """Which of clear windows, in order of time, are on the line or tell of a clock that has left it.
 
-    Lost samples move all that follows. A window that is off by itself has caught the echo of a sound without the sound.
+    Lost samples move all that follows, which is as clear as before. A window that is off by itself, or far less clear
+    than those on the line, has caught the echo of a sound without the sound.
     """
+    on_line = np.abs(residuals) <= _TOLERANCE_S
     alike = np.abs(np.diff(residuals)) <= _TOLERANCE_S
-    return (np.abs(residuals) <= _TOLERANCE_S) | np.append(alike, False) | np.append(False, alike)
+    lasts = np.append(alike, False) | np.append(False, alike)
+    usual = np.median(prominences[on_line]) if on_line.any() else 0.0
+    return on_line | (lasts & (prominences >= usual / _ECHO_CLARITY))
 
 
 def _window_seconds(overlap: float) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
+from splashbench.native.memory import give_back
 from splashbench.prepare.masks.provider import Mask
 from splashbench.prepare.video.strips import median_and_deviation
 
@@ -40,6 +41,7 @@ EDGE_RADIUS = 3
 CONTRAST_SIGMA_PX = 3.0
 MIN_AREA_SHARE = 1e-5  # of the image: smaller regions are compression artefacts
 MIN_AREA_PX = 4
+_STRIP_ROWS = 128  # compared at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,23 +69,33 @@ class EmptyScene:
         First, by how many standard deviations, after taking out what a shadow explains; second, by how many grey
         levels, with nothing taken out.
         """
-        image = frame.astype(np.float32) / self._gain(frame)
-        energy = np.maximum((self.median**2).sum(-1), 1.0)
-        brightness = (image * self.median).sum(-1) / energy
-        colour = np.sqrt(((image - brightness[..., None] * self.median) ** 2).sum(-1))
+        gain = self._gain(frame)
+        found = np.empty((2, *frame.shape[:2]), np.float32)
+        # In strips: the steps between of a whole 4K frame take 800 MB.
+        for top in range(0, len(frame), _STRIP_ROWS):
+            rows = slice(top, top + _STRIP_ROWS)
+            found[:, rows] = self._compared(frame[rows].astype(np.float32) / gain, rows)
+        return found[0], found[1]
+
+    def _compared(self, image: Floats, rows: slice) -> tuple[Floats, Floats]:
+        """`compare` of some rows, at the background's exposure."""
+        median = self.median[rows]
+        energy = np.maximum((median**2).sum(-1), 1.0)
+        brightness = (image * median).sum(-1) / energy
+        colour = np.sqrt(((image - brightness[..., None] * median) ** 2).sum(-1))
         change = np.abs(brightness - 1) * np.sqrt(energy)
         shadow = (brightness >= SHADOW_DARKEST) & (brightness <= SHADOW_BRIGHTEST)
         tint = SHADOW_TINT * change
         unexplained = np.where(shadow, np.sqrt(np.maximum(colour**2 - tint**2, 0.0)), np.hypot(colour, change))
-        difference = np.sqrt(((image - self.median) ** 2).sum(-1))
-        return (unexplained / self.noise).astype(np.float32), difference.astype(np.float32)
+        return unexplained / self.noise[rows], np.sqrt(((image - median) ** 2).sum(-1))
 
     def _gain(self, frame: NDArray[np.uint8]) -> Floats:
         """Exposure of the frame relative to the background, per channel: most of the image shows no liquid."""
         usable = self.median.min(-1) > 16
         if usable.mean() < 0.05:
             return np.ones(3, np.float32)
-        ratio = np.median(frame[usable].astype(np.float32) / self.median[usable], axis=0)
+        channels = zip(np.moveaxis(frame, -1, 0), np.moveaxis(self.median, -1, 0))
+        ratio = [np.median(shown[usable].astype(np.float32) / empty[usable]) for shown, empty in channels]
         return np.clip(ratio, 0.7, 1.4).astype(np.float32)
 
 
@@ -156,6 +168,7 @@ class BackgroundMasks:
                 " give masks in a folder, or start recording earlier"
             )
         background = EmptyScene.fit([frame for _, frame in self._read_frames(camera, quiet)])
+        give_back()  # the frames, which small arrays may hold in place
         for index, frame in self._read_frames(camera, indices):
             yield index, segment(*background.compare(frame))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from splashbench.prepare.poses import metric, scale
 from splashbench.prepare.poses import structure_from_motion as poses
 from splashbench.prepare.poses.board_rig import board_poses
 from splashbench.prepare.poses.board_sightings import shared_sightings
+from splashbench.prepare.poses.stored_frames import StoredFrames
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.video.recording import Recording
 from splashbench.prepare.video.stills import Stills, open_recording
@@ -103,14 +105,14 @@ class RigRecordings:
             self._static_pictures[camera] = median_frame([frame for _, frame in recording.frames(indices)])
         return self._static_pictures[camera]
 
-    def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> list[Image]:
+    def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> Iterator[Image]:
         """The `count` sharpest frames of the sweep, spread over it; none where there is no sweep."""
         if self.sweep is None:
-            return []
+            return iter(())
         if self._sharpness is None:
             self._sharpness = [poses.sharpness_of(luma) for _, luma in self.sweep.luma(SHARPNESS_WIDTH)]
         chosen = poses.sharpest_per_bin(self._sharpness, count)
-        return [frame for _, frame in self.sweep.frames(chosen)]
+        return (frame for _, frame in self.sweep.frames(chosen))
 
     def pose(
         self, lenses: Mapping[str, Lens], work: Path, lens_covariance: Mapping[str, Array] | None = None
@@ -153,25 +155,25 @@ def find_poses(
 
 def solve_poses(
     static: Mapping[str, Image],
-    sweep_images: Callable[[int], list[Image]],
+    sweep_images: Callable[[int], Iterable[Image]],
     lenses: Mapping[str, Lens],
     detector: Detector,
     work: Path,
     lens_covariance: Mapping[str, Array] | None = None,
-) -> tuple[poses.Poses, list[Image]]:
-    """Structure from motion of the static scene, and the frames of the sweep that it used.
+) -> tuple[poses.Poses, Sequence[Image]]:
+    """Structure from motion of the static scene, and the frames of the sweep that it used, which stand in `work`.
 
     `sweep_images`: the sweep's sharpest frames by their number (`RigRecordings.sweep_images`). Where they do not bridge
     the fixed cameras, twice as many are tried, and `Poses.attempts` begins with that. Raises SplashbenchError naming
     the cameras that could not be posed.
     """
-    sweep = sweep_images(poses.SWEEP_FRAMES)
+    sweep = StoredFrames(sweep_images(poses.SWEEP_FRAMES), work / "sweep")
     first, second = work / "first", work / "second"
     first.mkdir()
     try:
         return find_poses(static, sweep, lenses, detector, first, lens_covariance), sweep
     except SplashbenchError as error:
-        more = sweep_images(2 * poses.SWEEP_FRAMES)
+        more = StoredFrames(sweep_images(2 * poses.SWEEP_FRAMES), work / "more")
         if len(more) <= len(sweep):
             raise
         second.mkdir()
@@ -237,7 +239,7 @@ def _sightings(
     posed: poses.Poses,
     detect: Callable[[Image], BoardView | None],
 ) -> list[metric.Sighting]:
-    candidates = [(image, lenses[camera], posed.w2c[camera]) for camera, image in static.items()]
-    candidates += [(sweep[index], posed.sweep_lens, w2c) for index, w2c in zip(posed.sweep_indices, posed.sweep_w2c)]
-    views = [(detect(image), lens, w2c) for image, lens, w2c in candidates]
+    fixed = ((image, lenses[camera], posed.w2c[camera]) for camera, image in static.items())
+    swept = ((sweep[index], posed.sweep_lens, w2c) for index, w2c in zip(posed.sweep_indices, posed.sweep_w2c))
+    views = ((detect(image), lens, w2c) for image, lens, w2c in chain(fixed, swept))
     return [metric.Sighting(view, lens, w2c) for view, lens, w2c in views if view is not None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from splashbench.errors import SplashbenchError
+from splashbench.native.memory import give_back
 from splashbench.prepare.audio.sync import ClockFit
 from splashbench.prepare.calibration.intrinsics import Calibration
 from splashbench.prepare.poses import rig
@@ -54,7 +55,9 @@ def posed_rig(store: StageStore, recordings: RigRecordings, calibrations: Mappin
     def pose() -> PosedRig:
         try:
             with store.scratch() as scratch:
-                return recordings.pose(lenses, scratch, covariance)
+                posed = recordings.pose(lenses, scratch, covariance)
+            give_back()  # COLMAP's, as much again as all stages after it take
+            return posed
         except RuntimeError as error:  # COLMAP's, for one when its database finds the disk full
             raise SplashbenchError(
                 f"{session.directory}: COLMAP failed ({error}); check the space in {store.folder}"
