@@ -9,7 +9,7 @@ multiples of the noise, never of a particular colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,9 +53,9 @@ class EmptyScene:
     noise: Floats
 
     @classmethod
-    def fit(cls, frames: Sequence[NDArray[np.uint8]]) -> EmptyScene:
-        """From frames [H, W, 3] without liquid."""
-        median, deviation = median_and_deviation(frames)
+    def fit(cls, read: Callable[[], Iterable[NDArray[np.uint8]]], count: int) -> EmptyScene:
+        """From the `count` frames [H, W, 3] without liquid that `read` gives, as often as it is called."""
+        median, deviation = median_and_deviation(read, count)
         # The median absolute deviation of whole grey levels is coarse: neighbours share their noise.
         noise = cv2.blur((1.4826 * deviation).astype(np.float32), (9, 9))
         grey = median.mean(axis=-1)
@@ -167,7 +167,7 @@ class BackgroundMasks:
                 f" {MIN_BACKGROUND_FRAMES} are needed to learn the background;"
                 " give masks in a folder, or start recording earlier"
             )
-        background = EmptyScene.fit([frame for _, frame in self._read_frames(camera, quiet)])
+        background = EmptyScene.fit(lambda: (frame for _, frame in self._read_frames(camera, quiet)), len(quiet))
         give_back()  # the frames, which small arrays may hold in place
         for index, frame in self._read_frames(camera, indices):
             yield index, segment(*background.compare(frame))

@@ -24,7 +24,7 @@ from splashbench.prepare.poses.stored_frames import StoredFrames
 from splashbench.prepare.session import DESCRIPTION, Session
 from splashbench.prepare.video.recording import Recording
 from splashbench.prepare.video.stills import Stills, open_recording
-from splashbench.prepare.video.strips import median_frame
+from splashbench.prepare.video.strips import median_of
 
 Image = NDArray[np.uint8]
 
@@ -102,7 +102,9 @@ class RigRecordings:
             recording = self.static[camera]
             count = len(recording.frame_times)
             indices = np.unique(np.linspace(0, count - 1, min(count, STATIC_FRAMES)).astype(int)).tolist()
-            self._static_pictures[camera] = median_frame([frame for _, frame in recording.frames(indices)])
+            self._static_pictures[camera] = median_of(
+                lambda: (frame for _, frame in recording.frames(indices)), len(indices)
+            )
         return self._static_pictures[camera]
 
     def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> Iterator[Image]:

@@ -2,36 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+Frame = NDArray[np.uint8]
+
+#: Bytes of frames that are held at once; where they have more, they are read several times.
+HELD_BYTES = 256 << 20
 _STRIP_BYTES = 4 << 20
 
 
-def strips(frames: Sequence[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
-    """Yield the same rows of all frames [H, W, 3] as one stack [N, rows, W, 3], from the top to the bottom."""
-    rows = max(1, _STRIP_BYTES * len(frames[0]) // (len(frames) * frames[0].nbytes))
-    for start in range(0, len(frames[0]), rows):
-        yield np.stack([frame[start : start + rows] for frame in frames])
-
-
-def median_frame(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def median_frame(frames: Sequence[Frame]) -> Frame:
     """The median over frames [H, W, 3] or [H, W] of a scene in which nothing moves: the same picture, less noise."""
-    return np.concatenate([_median(stack).round().astype(np.uint8) for stack in strips(frames)])
+    return np.concatenate([_median(stack).round().astype(np.uint8) for stack in _strips(frames)])
 
 
-def median_and_deviation(frames: Sequence[NDArray[np.uint8]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The median over frames [H, W, 3], and the median distance from it, mean over the channels, [H, W]."""
+def median_of(read: Callable[[], Iterable[Frame]], count: int) -> Frame:
+    """`median_frame` of the `count` frames that `read` gives, as often as it is called."""
+    return np.concatenate([median_frame(band) for band in _bands(read, count)])
+
+
+def median_and_deviation(
+    read: Callable[[], Iterable[Frame]], count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of the `count` frames [H, W, 3] that `read` gives, as often as it is called: the median [H, W, 3], and the median
+    distance from it, mean over the channels, [H, W]."""
     found = []
-    for stack in strips(frames):
+    for stack in (stack for band in _bands(read, count) for stack in _strips(band)):
         median = _median(stack).astype(np.float32)
         found.append((median, np.median(np.abs(stack - median), axis=0, overwrite_input=True).mean(axis=-1)))
     median, deviation = (np.concatenate(parts) for parts in zip(*found))
     return median, deviation
 
 
-def _median(stack: NDArray[np.uint8]) -> NDArray[Any]:
+def _bands(read: Callable[[], Iterable[Frame]], count: int) -> Iterator[list[Frame]]:
+    """Yield the same rows of all frames, from the top to the bottom, as many at a time as may be held."""
+    top, height, rows = 0, 1, 1
+    while top < height:
+        band = []
+        for frame in read():
+            height = len(frame)
+            rows = max(1, HELD_BYTES * height // (count * frame.nbytes))
+            # A copy, where it is a part: else the whole frame stays.
+            band.append(frame if rows >= height else frame[top : top + rows].copy())
+        yield band
+        top += rows
+
+
+def _strips(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Yield the same rows of all frames as one stack [N, rows, W, ...], from the top to the bottom."""
+    rows = max(1, _STRIP_BYTES * len(frames[0]) // (len(frames) * frames[0].nbytes))
+    for start in range(0, len(frames[0]), rows):
+        yield np.stack([frame[start : start + rows] for frame in frames])
+
+
+def _median(stack: Frame) -> NDArray[Any]:
     return np.median(stack, axis=0)

@@ -41,13 +41,18 @@ def intersection_over_union(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
+def fitted(empty: np.ndarray, rng: np.random.Generator) -> EmptyScene:
+    frames = [recorded(empty, rng) for _ in range(15)]
+    return EmptyScene.fit(lambda: frames, 15)
+
+
 @pytest.mark.parametrize(
     "liquid", [(60, 90, 190), (200, 60, 50), (235, 235, 235), (35, 30, 25), (60, 150, 70)], ids=str
 )
 def test_liquid_of_any_colour_is_found_despite_noise_shadow_and_exposure(liquid: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(1)
     empty = scenery(rng)
-    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
+    background = fitted(empty, rng)
     lit = empty * (1 - 0.4 * cv2.GaussianBlur(blob(22, 175, 60), (0, 0), 4))[..., None]  # a shadow, 40% darker
     coverage = blob(25, 90, 90)
     coverage = np.maximum(coverage, blob(3, 60, 30))  # a droplet
@@ -60,7 +65,7 @@ def test_liquid_of_any_colour_is_found_despite_noise_shadow_and_exposure(liquid:
 def test_an_empty_frame_has_an_empty_mask() -> None:
     rng = np.random.default_rng(2)
     empty = scenery(rng)
-    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
+    background = fitted(empty, rng)
     for _ in range(5):
         assert not segment(*background.compare(recorded(empty, rng))).any()
 
@@ -70,7 +75,7 @@ def test_a_change_of_the_whole_picture_is_no_liquid(gain: tuple[float, float, fl
     """Beyond what a shadow or a reflection explains: the camera has set its exposure or white balance anew."""
     rng = np.random.default_rng(5)
     empty = scenery(rng)
-    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
+    background = fitted(empty, rng)
     coverage = blob(25, 90, 90)
     frame = (empty * (1 - coverage[..., None]) + np.array([60, 90, 190]) * coverage[..., None]) * gain
     assert intersection_over_union(segment(*background.compare(recorded(frame, rng))), coverage > 0.5) > 0.95
@@ -80,7 +85,7 @@ def test_a_change_of_the_whole_picture_is_no_liquid(gain: tuple[float, float, fl
 def test_a_thin_stream_keeps_its_width() -> None:
     rng = np.random.default_rng(3)
     empty = scenery(rng)
-    background = EmptyScene.fit([recorded(empty, rng) for _ in range(15)])
+    background = fitted(empty, rng)
     columns = np.arange(WIDTH) + 0.5
     coverage = np.clip(3.0 - np.abs(columns - 120.0) + 0.5, 0, 1)[None].repeat(HEIGHT, 0)  # six pixels wide
     soft = cv2.GaussianBlur(coverage, (0, 0), 0.8)[..., None]  # the lens and the codec blur it
