@@ -107,6 +107,10 @@ class RigRecordings:
             )
         return self._static_pictures[camera]
 
+    def forget_pictures(self) -> None:
+        """Hold no picture of the static scene any more; one that is asked for is made again."""
+        self._static_pictures.clear()
+
     def sweep_images(self, count: int = poses.SWEEP_FRAMES) -> Iterator[Image]:
         """The `count` sharpest frames of the sweep, spread over it; none where there is no sweep."""
         if self.sweep is None:

@@ -32,7 +32,10 @@ def stillness(
     }
 
     def compare() -> dict[str, Stillness]:
-        return find_stillness(recordings.static_image, pour.recordings, clocks, interval)
+        found = find_stillness(recordings.static_image, pour.recordings, clocks, interval)
+        recordings.forget_pictures()  # no later stage looks at them
+        give_back()
+        return found
 
     return store.result("poses", dict[str, Stillness], inputs, compare, part="stillness")
 

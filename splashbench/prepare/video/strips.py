@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Frame = NDArray[np.uint8]
 
 #: Bytes of frames that are held at once; where they have more, they are read several times.
-HELD_BYTES = 256 << 20
+HELD_BYTES = 192 << 20
 _STRIP_BYTES = 4 << 20
 
 
@@ -22,7 +22,7 @@ def median_frame(frames: Sequence[Frame]) -> Frame:
 
 def median_of(read: Callable[[], Iterable[Frame]], count: int) -> Frame:
     """`median_frame` of the `count` frames that `read` gives, as often as it is called."""
-    return np.concatenate([median_frame(band) for band in _bands(read, count)])
+    return np.concatenate([median_frame(band) for band, _ in _bands(read, count)])
 
 
 def median_and_deviation(
@@ -30,25 +30,33 @@ def median_and_deviation(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Of the `count` frames [H, W, 3] that `read` gives, as often as it is called: the median [H, W, 3], and the median
     distance from it, mean over the channels, [H, W]."""
-    found = []
-    for stack in (stack for band in _bands(read, count) for stack in _strips(band)):
-        median = _median(stack).astype(np.float32)
-        found.append((median, np.median(np.abs(stack - median), axis=0, overwrite_input=True).mean(axis=-1)))
-    median, deviation = (np.concatenate(parts) for parts in zip(*found))
+    median, deviation = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32)
+    top = 0
+    for band, shape in _bands(read, count):
+        if top == 0:
+            median, deviation = np.empty(shape, np.float32), np.empty(shape[:2], np.float32)
+        for stack in _strips(band):
+            rows = slice(top, top + stack.shape[1])
+            median[rows] = _median(stack)
+            apart = np.abs(stack - median[rows])
+            deviation[rows] = np.median(apart, axis=0, overwrite_input=True).mean(axis=-1)
+            top = rows.stop
     return median, deviation
 
 
-def _bands(read: Callable[[], Iterable[Frame]], count: int) -> Iterator[list[Frame]]:
-    """Yield the same rows of all frames, from the top to the bottom, as many at a time as may be held."""
+def _bands(read: Callable[[], Iterable[Frame]], count: int) -> Iterator[tuple[list[Frame], tuple[int, ...]]]:
+    """Yield the same rows of all frames, from the top to the bottom, as many at a time as may be held; and the frames'
+    shape."""
     top, height, rows = 0, 1, 1
+    shape: tuple[int, ...] = ()
     while top < height:
         band = []
         for frame in read():
-            height = len(frame)
+            shape, height = frame.shape, len(frame)
             rows = max(1, HELD_BYTES * height // (count * frame.nbytes))
             # A copy, where it is a part: else the whole frame stays.
             band.append(frame if rows >= height else frame[top : top + rows].copy())
-        yield band
+        yield band, shape
         top += rows
 
 
