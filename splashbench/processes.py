@@ -81,6 +81,17 @@ def deny_access() -> None:
     _prctl(_PR_SET_DUMPABLE, 0)
 
 
+def limit_memory(max_bytes: int) -> None:
+    """Let the kernel hold this process to so many bytes of address space, or to what it may have if that is less, and
+    write no core file."""
+    import resource
+
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    limit = max_bytes if most == resource.RLIM_INFINITY else min(max_bytes, most)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
 def end_descendants() -> list[str]:
     """Kill all processes below this one, which has adopted orphans; a line for each that was found alive."""
     found: list[str] = []

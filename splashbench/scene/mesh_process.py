@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from splashbench.child import child_command
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_npz, read_plain, require_plain_file, write_text
+from splashbench.processes import limit_memory
 
 #: Of the child: address space, processor time, and patience with a busy machine.
 MAX_MEMORY_BYTES, MAX_SECONDS, _MAX_WAIT_SECONDS = 4 << 30, 60, 300
@@ -68,9 +69,8 @@ def _too_much(path: Path) -> SplashbenchError:
 
 def carry_out(path: str, folder: str, max_faces: str) -> int:
     """Decode the mesh `path` into `folder`, or leave there what is wrong with it."""
-    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
+    limit_memory(MAX_MEMORY_BYTES)
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_SECONDS, MAX_SECONDS + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         vertices, faces = decoded(Path(path), int(max_faces))
     except MemoryError:

@@ -52,7 +52,9 @@ _TOLERANCE_S = 4e-4  # windows this close to the common line support it
 # What must agree with a clock: windows (of neighbours, every second one), a share of all, from first to last.
 MIN_AGREEING, MIN_AGREEMENT, MIN_SPREAD_S = 3, 0.1, 1.0
 _AUDIBLE, _CLEAR = 1.2, 2.0  # a window's peak over the next one: hardly chance, and no chance
-_ECHO_CLARITY = 3.0  # how many times as clear as an echo caught alone the usual window is, at the least
+# Of the clarity of the usual window: an echo caught alone has at most a quarter, what follows lost samples a third and
+# more.
+_ECHO_CLARITY = 0.29
 _BLOCK = 4096  # samples per transform
 _REACH_S = 0.02  # windows may lie this far from the line
 _SIGMAS = 2.0  # of a stated interval, 95 %
@@ -274,7 +276,7 @@ def _clock(
     _, residuals = _inliers(supporting, line, np.inf)
     distinct = [window for window in separate if window.prominence >= _CLEAR]
     _, clear = _inliers(distinct, line, np.inf)
-    clear = clear[_lasting(clear, np.array([window.prominence for window in distinct]))]
+    clear = clear[_heard_itself(clear, np.array([window.prominence for window in distinct]))]
     return ClockFit(
         line[0],
         line[1],
@@ -288,17 +290,15 @@ def _clock(
     )
 
 
-def _lasting(residuals: Floats, prominences: Floats) -> NDArray[np.bool_]:
-    """Which of clear windows, in order of time, are on the line or tell of a clock that has left it.
+def _heard_itself(residuals: Floats, prominences: Floats) -> NDArray[np.bool_]:
+    """Which of clear windows are on the line, or off it and nearly as clear as those on it.
 
-    Lost samples move all that follows, which is as clear as before. A window that is off by itself, or far less clear
-    than those on the line, has caught the echo of a sound without the sound.
+    Samples that were lost move all that follows, and leave it as clear. A window that is far less clear has caught the
+    echo of a sound without the sound.
     """
     on_line = np.abs(residuals) <= _TOLERANCE_S
-    alike = np.abs(np.diff(residuals)) <= _TOLERANCE_S
-    lasts = np.append(alike, False) | np.append(False, alike)
     usual = np.median(prominences[on_line]) if on_line.any() else 0.0
-    return on_line | (lasts & (prominences >= usual / _ECHO_CLARITY))
+    return on_line | (prominences >= _ECHO_CLARITY * usual)
 
 
 def _window_seconds(overlap: float) -> float:

@@ -186,7 +186,7 @@ def _label(text: str | None) -> str | None:
 def scan(path: Path, tick: Callable[[], None]) -> Chapter:
     """Read the packets of a file without decoding them; complains when fewer are there than promised.
 
-    tick: is called now and then, while packets come.
+    tick: is called with every packet.
     """
     pts: list[int] = []
     entries: list[int] = []

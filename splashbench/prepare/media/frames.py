@@ -17,7 +17,7 @@ from .container import COPY_AGAIN, Chapter, open_media, packets, require_sane, v
 
 
 def whole(chapter: Chapter, wanted: Sequence[int], tick: Callable[[], None]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield (index, sRGB uint8 [H, W, 3]) of the frames `wanted`, which increase. tick: is called with every frame.
+    """Yield (index, sRGB uint8 [H, W, 3]) of the frames `wanted`, which increase. tick: is called with every packet.
 
     Raises SplashbenchError when one cannot be decoded.
     """

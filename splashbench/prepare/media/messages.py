@@ -1,7 +1,7 @@
 """Messages between a process and the one that decodes for it: a head in JSON, and arrays as they lie in memory.
 
-Nothing is unpickled, and every size is checked before memory is taken for it. The other end may be a decoder that a
-hostile file has taken over.
+Nothing is unpickled, and every size is checked before memory is taken for it: a decoder that a file has broken may say
+anything.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import math
 import os
 import select
 import struct
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +20,10 @@ from numpy.typing import NDArray
 #: Of one message: its head, and all of its arrays.
 MAX_HEAD_BYTES, MAX_ARRAY_BYTES = 1 << 20, 1 << 30
 _TYPES = {name: np.dtype(name) for name in ("u1", "i8", "f4")}
+_TURNS = 50
 _LENGTH = struct.Struct("<I")
+
+Message = tuple[dict[str, Any], list[NDArray[Any]]]
 
 
 class EndedError(Exception):
@@ -54,7 +56,7 @@ def send(
         raise EndedError from None
 
 
-def receive(descriptor: int, patience_s: float | None = None) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+def receive(descriptor: int, patience_s: float | None = None) -> Message:
     """Read one message. patience_s: how long nothing may come, without end by default.
 
     Raises EndedError at the end, or at anything that is no message, and SilenceError.
@@ -98,9 +100,10 @@ def _fill(descriptor: int, left: memoryview, patience_s: float | None) -> None:
 
 
 def _wait(descriptor: int, until_what: int, patience_s: float) -> None:
-    until = time.monotonic() + patience_s
     poll = select.poll()
     poll.register(descriptor, until_what)
-    while not poll.poll(max(0.0, until - time.monotonic()) * 1000):
-        if time.monotonic() >= until:
-            raise SilenceError
+    # In short turns: the time in which this process is stopped, as by Ctrl-Z, is one of them at the most.
+    for _ in range(_TURNS):
+        if poll.poll(patience_s * 1000 / _TURNS):
+            return
+    raise SilenceError

@@ -1,7 +1,8 @@
 """Media files read through a child process, which is held to limits of memory and time.
 
 FFmpeg believes what a file states of itself, and its readers are many. A file that asks for gigabytes, that never
-ends, or that breaks the decoder costs the child, and one line tells of it.
+ends, or that breaks the decoder costs the child, and one line tells of it. It is no wall: code that a file made FFmpeg
+run would have the user's rights.
 
 A child is kept for the next file, since starting one costs a quarter of a second. It decodes ahead while the frame
 before is looked at.
@@ -25,7 +26,7 @@ from splashbench.child import child_command
 from splashbench.errors import SplashbenchError
 
 from .container import COPY_AGAIN, Chapter, VideoInfo, damaged
-from .messages import EndedError, SilenceError, receive, send
+from .messages import EndedError, Message, SilenceError, receive, send
 from .worker import MAX_MEMORY_BYTES, serve
 
 #: How long a child may work on a file without a sign of life, and how long it may take to start.
@@ -33,8 +34,6 @@ PATIENCE_S, START_S = 45.0, 120.0
 _PIPE_BYTES = 1 << 20
 _END_SECONDS = 5.0
 _MAX_FAULT = 1000
-
-Answer = tuple[dict[str, Any], list[NDArray[Any]]]
 
 
 def probe(path: Path) -> VideoInfo:
@@ -96,7 +95,7 @@ def _images(
 
 @contextmanager
 def _as_it_should_be(path: Path) -> Iterator[None]:
-    """Tell where a child's answer is none to what it was asked: a file has taken it over."""
+    """Tell where a child's answer is none to what it was asked: a file has broken it."""
     try:
         yield
     except (TypeError, ValueError, KeyError, IndexError):
@@ -104,11 +103,11 @@ def _as_it_should_be(path: Path) -> Iterator[None]:
         raise SplashbenchError(damaged(path, "the decoder says what makes no sense")) from None
 
 
-def _asked(request: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> Generator[Answer]:
+def _asked(request: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> Generator[Message]:
     """Yield the answers of a child to `request`. Raises SplashbenchError with what is wrong with the file."""
     path = Path(request["path"])
     if not path.is_absolute():
-        request |= {"folder": str(Path.cwd())}  # a child stays where it was started
+        request |= {"folder": _here(path)}  # a child stays where it was started
     while True:
         child, is_free = _children.take(path), False
         is_kept = child.is_ready  # from a file before
@@ -136,6 +135,13 @@ def _asked(request: dict[str, Any], arrays: Sequence[NDArray[Any]] = ()) -> Gene
             raise SplashbenchError(damaged(path, child.how_it_ended())) from None
         finally:
             _children.give_back(child, is_free)
+
+
+def _here(path: Path) -> str:
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:
+        raise SplashbenchError(f"{path} does not exist, since the current folder was removed; go to another") from None
 
 
 class _Child:

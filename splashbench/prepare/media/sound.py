@@ -29,7 +29,7 @@ _BLOCK = 1 << 18
 def pieces(path: Path, tick: Callable[[], None]) -> Iterator[tuple[float | None, int, Samples]]:
     """Yield blocks of samples: (time of the first one in the file's own time, samples a second, samples).
 
-    The time is None where a block follows the one before it. tick: is called with everything that is decoded. Raises
+    The time is None where a block follows the one before it. tick: is called with every packet. Raises
     SplashbenchError without a sound track.
     """
     native = count = n_pieces = 0

@@ -18,10 +18,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from splashbench.errors import SplashbenchError
-from splashbench.processes import outlive_parent
+from splashbench.processes import limit_memory, outlive_parent
 
 from . import container, frames, sound
-from .messages import EndedError, receive, send
+from .messages import EndedError, Message, receive, send
 
 #: Of address space.
 MAX_MEMORY_BYTES = 4 << 30
@@ -29,8 +29,6 @@ MAX_MEMORY_BYTES = 4 << 30
 _TICK_SECONDS = 5.0
 _PARENT_SECONDS = 0.5
 _MAX_FAULT = 300
-
-Answer = tuple[dict[str, Any], list[NDArray[Any]]]
 
 
 def serve(max_memory_bytes: str) -> int:
@@ -42,10 +40,7 @@ def serve(max_memory_bytes: str) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a group; whoever asks decides
     outlive_parent()  # the end of a thread counts as its process's, and one may ask that another has begun with
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    limit = int(max_memory_bytes) if most == resource.RLIM_INFINITY else min(int(max_memory_bytes), most)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit_memory(int(max_memory_bytes))
     try:
         send(answers, {"ready": True})
         while True:
@@ -87,7 +82,7 @@ def answer(request: dict[str, Any], arrays: list[NDArray[Any]], out: int) -> Non
         send(out, {"fault": container.damaged(path, " ".join(said.split())), "worn": True})
 
 
-def _answers(request: dict[str, Any], arrays: list[NDArray[Any]], tick: _Ticks) -> Iterator[Answer]:
+def _answers(request: dict[str, Any], arrays: list[NDArray[Any]], tick: _Ticks) -> Iterator[Message]:
     path, task = Path(request["path"]), request["task"]
     if task == "probe":
         yield asdict(container.probe(path)), []

@@ -54,3 +54,13 @@ def lies(max_memory_bytes: str) -> int:
     send(1, {"done": True})
     time.sleep(600)
     return 0
+
+
+def dawdles(max_memory_bytes: str) -> int:
+    """Takes a second for each answer."""
+    send(1, {"ready": True})
+    while os.read(0, 4096):
+        for _ in range(20):  # of being awake
+            time.sleep(0.05)
+        send(1, {"fault": "it has dawdled"})
+    return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -119,6 +120,41 @@ def test_a_child_that_does_not_listen_is_given_up(film: Path, monkeypatch: pytes
     monkeypatch.setattr(reading, "PATIENCE_S", 0.4)
     with pytest.raises(SplashbenchError, match="nothing came of it"):
         list(reading.frames(long, [0]))
+
+
+def test_the_time_in_which_all_are_stopped_does_not_count(film: Path) -> None:
+    """Ctrl-Z stops whoever asks and the child alike."""
+    code = (
+        "import sys\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import bad_decoders\n"
+        "from pathlib import Path\n"
+        "from splashbench.errors import SplashbenchError\n"
+        "from splashbench.prepare.media import reading\n"
+        "reading.serve, reading.PATIENCE_S = bad_decoders.dawdles, 2.0\n"
+        "for turn in range(2):\n"
+        "    try:\n"
+        "        reading.probe(Path(sys.argv[1]))\n"
+        "    except SplashbenchError as error:\n"
+        "        print(error, flush=True)\n"
+    )
+    command = [sys.executable, "-c", code, film]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as asks:
+        assert asks.stdout is not None
+        assert asks.stdout.readline() == "it has dawdled\n"
+        time.sleep(0.3)
+        os.killpg(asks.pid, signal.SIGSTOP)
+        time.sleep(3)
+        os.killpg(asks.pid, signal.SIGCONT)
+        assert asks.stdout.readline() == "it has dawdled\n"
+
+
+def test_a_removed_current_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(SplashbenchError, match=r"film\.mp4 does not exist, since the current folder was removed"):
+        reading.probe(Path("film.mp4"))
 
 
 def test_a_file_is_looked_for_where_this_process_is(
