@@ -28,7 +28,7 @@ HEADINGS
 FRAMES
 <script>
 for (const frame of document.querySelectorAll("iframe"))
-  frame.src = `http://${location.hostname}:${frame.dataset.port}/`;
+  frame.src = `http://${location.hostname}:${frame.dataset.port}/${location.search}`;
 </script></body></html>
 """
 

@@ -215,6 +215,11 @@ def test_it_asks_nobody_but_its_own_server_and_does_not_complain(session: Sessio
     assert len(session.browser.requests) > 1
 
 
+def test_slow_drawing_makes_no_smaller_pictures(session: Session) -> None:
+    """viser lowers the resolution where drawing is slow, which a picture of a stated size must not show."""
+    assert any(address.endswith("/?fixedDpr=1") for address in session.browser.requests)
+
+
 def test_two_halves_have_one_camera(fit: Path, balls_directory: Path) -> None:
     session = Session([fit, balls_directory], balls_directory)
     try:
@@ -227,6 +232,9 @@ def test_two_halves_have_one_camera(fit: Path, balls_directory: Path) -> None:
         widths = [client.camera.image_width for client in (left, right)]
         # The panel takes a part of the left frame; the pictures are equally wide.
         assert abs((widths[0] - 320) - widths[1]) <= 4, widths
+        # What the address asks for reaches both.
+        for half in session.viewer.halves:
+            assert any(f":{half.server.get_port()}/?fixedDpr=1" in each for each in session.browser.requests)
         assert session.complaints() == []
     finally:
         session.close()
