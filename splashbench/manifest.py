@@ -8,6 +8,7 @@ each column and the statements of the paper that contradict one another.
 from __future__ import annotations
 
 import csv
+from functools import cache
 from importlib.resources import files
 from typing import Literal
 
@@ -20,11 +21,13 @@ __all__ = [
     "ArchiveEntry",
     "DatasetFacts",
     "Evaluation",
+    "NeuroFluidSource",
     "SceneFacts",
     "Target",
     "load_archive",
     "load_comparison",
     "load_evaluation",
+    "load_neurofluid",
     "load_scenes",
     "load_targets",
 ]
@@ -117,6 +120,23 @@ class Archive(_Record):
     layout: tuple[ArchiveEntry, ...]
 
 
+class NeuroFluidSource(_Record):
+    """Where the authors of NeuroFluid put their synthetic scenes, and which of them the paper scores or names.
+
+    `license` is null because the authors state none.
+    """
+
+    schema_version: Literal[1]
+    name: str
+    drive_folder_id: str
+    url: str
+    repository: str
+    license: str | None
+    attribution: str
+    checksum_note: str
+    scenes: tuple[str, ...]
+
+
 class DatasetFacts(_Record):
     """One row of Table 1, the comparison of fluid datasets; null means not applicable or not reported there."""
 
@@ -171,6 +191,12 @@ def load_evaluation() -> Evaluation:
 def load_archive() -> Archive:
     """Where the released archive is and what it holds."""
     return Archive.model_validate_json(_text("archive.json"))
+
+
+@cache
+def load_neurofluid() -> NeuroFluidSource:
+    """Where NeuroFluid's scenes are, and their names."""
+    return NeuroFluidSource.model_validate_json(_text("neurofluid.json"))
 
 
 def load_comparison() -> list[DatasetFacts]:

@@ -1,4 +1,4 @@
-"""`splashbench download`: fetch what is needed and not ours to ship, once: LPIPS weights, the released scenes."""
+"""`splashbench download`: fetch what is needed and not ours to ship, once: LPIPS weights, released scenes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ _SCENES_EXAMPLES = """\
   splashbench download scenes REAL --variant full crop       as recorded, too: with the masks of the container
   splashbench download scenes REAL --from real_scene.zip     the archive fetched by other means
 """
-_EXAMPLES = f"examples:\n{_LPIPS_EXAMPLES}{_SCENES_EXAMPLES}"
+_NEUROFLUID_EXAMPLES = """\
+  splashbench download neurofluid SYNTHETIC                  WaterSphere, WaterCube and HoneyCone
+  splashbench download neurofluid WaterSphere SYNTHETIC      one of them
+  splashbench download neurofluid SYNTHETIC --from part1.zip part2.zip    what a browser fetched
+"""
+_EXAMPLES = f"examples:\n{_LPIPS_EXAMPLES}{_SCENES_EXAMPLES}{_NEUROFLUID_EXAMPLES}"
 
 _LPIPS = """
 AlexNet's weights come from torchvision (alexnet-owt-7be5be79.pth, 244 MB) and the linear weights from the authors of
@@ -40,7 +45,16 @@ first comes (real_scene.zip.json) and verified after. The archive stays in DIR; 
 Unpacked is what the known layout holds: DIR/real_scene, DIR/real_scene_crop, DIR/meshes with scans of containers. Every
 scene is checked, and a status of 1 says that one has a fault. Times come from Table S1 of the paper.
 Where the drive refuses, as it does after many downloads, open its address in a browser, and give the file by --from.
-NeuroFluid's scenes are not in the archive, and no address of theirs is known here (docs/benchmark.md).
+NeuroFluid's scenes are fetched by `splashbench download neurofluid`.
+"""
+
+_NEUROFLUID = """
+The authors of NeuroFluid share a folder of a public drive (data_manifest/neurofluid.json); they state no licence. How
+the scenes lie in it is not documented. So every file that may belong to a wanted scene is fetched into DIR/neurofluid,
+and what has the layout of these scenes is unpacked to DIR/NAME: from folders, zip and tar archives. Nothing else is,
+pickles above all. Size and SHA-256 of each file are noted in DIR/neurofluid.json when it first comes, and verified
+after. An interrupted download goes on where it stopped, and scenes that are there stay. A status of 1 says that a scene
+has a fault. Where the drive refuses, fetch the scenes with a browser, and give folders or archives by --from.
 """
 
 
@@ -49,7 +63,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     actions = add_group(
         subparsers,
         "download",
-        summary="fetch the weights of LPIPS and the released scenes, once",
+        summary="fetch the weights of LPIPS and released scenes, once",
         description="Fetch public files that are needed and not ours to ship, once, and verify them.",
         epilog=_EXAMPLES,
     )
@@ -96,6 +110,30 @@ def _register_scenes(actions: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--url", metavar="URL", help="fetch the archive from a copy at this address")
     parser.add_argument("--check", action="store_true", help="check scenes again that were checked before")
+    _register_neurofluid(actions)
+
+
+def _register_neurofluid(actions: argparse._SubParsersAction) -> None:
+    parser = add_command(
+        actions,
+        "neurofluid",
+        neurofluid,
+        summary="NeuroFluid's synthetic scenes, checked",
+        description="Fetch NeuroFluid's synthetic scenes into DIR (all three by default), unpack and check them.",
+        epilog=f"examples:\n{_NEUROFLUID_EXAMPLES}{_NEUROFLUID}",
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="WaterSphere, WaterCube, HoneyCone (default: all)")
+    parser.add_argument("out", type=Path, metavar="DIR", help="folder of the scenes; the last word")
+    parser.add_argument(
+        "--from",
+        type=Path,
+        nargs="+",
+        default=[],
+        dest="by_hand",
+        metavar="PATH",
+        help="take these folders and archives (zip, tar); no network is needed",
+    )
+    parser.add_argument("--check", action="store_true", help="check scenes again that were checked before")
 
 
 def lpips_weights(arguments: argparse.Namespace) -> int:
@@ -119,7 +157,6 @@ def scenes(arguments: argparse.Namespace) -> int:
     """Handle `splashbench download scenes`."""
     from splashbench.download.archive import ArchiveSource, read_note
     from splashbench.download.scenes import download_scenes
-    from splashbench.errors import one_line
 
     if arguments.url is not None and not arguments.url.startswith(("https://", "http://")):
         arguments.usage_error(f"--url {arguments.url!r} is no address of the web; a file is given by --from")
@@ -139,16 +176,7 @@ def scenes(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt as error:
         return _interrupted(error)
     say(table(["scene", "variant", "frames", "seconds", "times from", "container"], [_row(each) for each in reports]))
-    for report in reports:
-        for fault in report.faults:
-            say(f"error: {one_line(fault)}")
-    faulty = [report for report in reports if report.faults]
-    made = sum(report.made for report in reports)
-    say(f"{len(reports)} scenes in {arguments.out}, {made} unpacked now, {len(faulty)} with faults")
-    if faulty:
-        say(f"error: {faulty[0].folder} has a fault, see above; remove that folder to unpack it again")
-    else:
-        say(f"run methods on them with: splashbench benchmark run OUT --scenes {arguments.out}")
+    faulty = _say_faults(arguments.out, reports)
     if arguments.json:
         note = read_note(arguments.out, source)
         emit(
@@ -160,6 +188,41 @@ def scenes(arguments: argparse.Namespace) -> int:
             }
         )
     return 1 if faulty else 0
+
+
+def neurofluid(arguments: argparse.Namespace) -> int:
+    """Handle `splashbench download neurofluid`."""
+    from splashbench.download.neurofluid import download_neurofluid
+
+    try:
+        reports = download_neurofluid(
+            arguments.out, arguments.names, arguments.by_hand, tell=say, check_again=arguments.check
+        )
+    except KeyboardInterrupt as error:
+        return _interrupted(error)
+    rows = [[each.name, str(each.frames), f"{each.seconds:.2f}"] for each in reports]
+    say(table(["scene", "frames", "seconds"], rows))
+    faulty = _say_faults(arguments.out, reports)
+    if arguments.json:
+        emit({"out": str(arguments.out), "scenes": [_facts(report) for report in reports]})
+    return 1 if faulty else 0
+
+
+def _say_faults(out: Path, reports: list[SceneReport]) -> bool:
+    """Tell the faults of scenes, and what to do next; returns whether there are any."""
+    from splashbench.errors import one_line
+
+    for report in reports:
+        for fault in report.faults:
+            say(f"error: {one_line(fault)}")
+    faulty = [report for report in reports if report.faults]
+    made = sum(report.made for report in reports)
+    say(f"{len(reports)} scenes in {out}, {made} unpacked now, {len(faulty)} with faults")
+    if faulty:
+        say(f"error: {faulty[0].folder} has a fault, see above; remove that folder to unpack it again")
+    else:
+        say(f"run methods on them with: splashbench benchmark run OUT --scenes {out}")
+    return bool(faulty)
 
 
 def _row(report: SceneReport) -> list[str]:

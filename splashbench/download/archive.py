@@ -137,7 +137,7 @@ def _fetched(
     cookies = CookieJar()
     tell(f"looking for {source.name} at {source.page}")
     try:
-        located = _patiently_located(source, patience, cookies, tell)
+        located = patiently_located(source.url, patience, cookies, tell)
     except (RefusedError, LostError) as error:
         raise SplashbenchError(f"{source.name} could not be fetched from {source.page}: {error}; {remedy}") from None
     found = located.size
@@ -174,14 +174,12 @@ def _fetched(
     return known
 
 
-def _patiently_located(
-    source: ArchiveSource, patience: Patience, cookies: CookieJar, tell: Callable[[str], None]
-) -> Located:
+def patiently_located(url: str, patience: Patience, cookies: CookieJar, tell: Callable[[str], None]) -> Located:
     """Where the archive is for now. Raises RefusedError, or LostError after as many tries as `patience` has."""
     wait = patience.wait_seconds
     for left in range(patience.tries - 1, -1, -1):
         try:
-            return locate(source.url, patience.timeout_seconds, cookies)
+            return locate(url, patience.timeout_seconds, cookies)
         except LostError as lost:
             if not left:
                 raise

@@ -23,6 +23,9 @@ from urllib.parse import urlsplit
 
 from splashbench.version import __version__
 
+#: What requests call the program, and what they call it where pages are meant for browsers.
+AGENT = f"splashbench/{__version__}"
+BROWSER_AGENT = f"Mozilla/5.0 (compatible; {AGENT})"
 _BLOCK_BYTES = 1 << 18
 _LONGEST_WAIT_SECONDS = 60.0
 _PAGES = ("text/html", "application/xhtml+xml")
@@ -81,14 +84,17 @@ class Answer:
 
 
 @contextmanager
-def ask(url: str, offset: int, timeout_seconds: float, cookies: CookieJar | None = None) -> Iterator[Answer]:
+def ask(
+    url: str, offset: int, timeout_seconds: float, cookies: CookieJar | None = None, agent: str = AGENT
+) -> Iterator[Answer]:
     """Ask for the bytes of `url` from `offset` on; the server may answer with the whole file.
 
     cookies: those of earlier answers, which this one may add to; none are sent or taken where there is no jar.
+    agent: what the program calls itself.
 
     Raises RefusedError, LostError or OutOfRangeError.
     """
-    headers = {"User-Agent": f"splashbench/{__version__}", "Accept-Encoding": "identity"}
+    headers = {"User-Agent": agent, "Accept-Encoding": "identity"}
     if offset:
         headers["Range"] = f"bytes={offset}-"
     try:

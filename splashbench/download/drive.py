@@ -27,9 +27,13 @@ _FAULTS = ("uc-error-subcaption", "uc-error-caption")
 _LOGIN = re.compile(r"^accounts\.", re.IGNORECASE)
 
 
-def drive_address(file_id: str) -> str:
+#: Google Drive's own address.
+DRIVE = "https://drive.google.com"
+
+
+def drive_address(file_id: str, drive: str = DRIVE) -> str:
     """The address of a file of Google Drive, which answers with the file or with a page."""
-    return f"https://drive.google.com/uc?{urlencode({'export': 'download', 'id': file_id})}"
+    return f"{drive}/uc?{urlencode({'export': 'download', 'id': file_id})}"
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ def locate(url: str, timeout_seconds: float, cookies: CookieJar | None = None) -
         with ask(url, 0, timeout_seconds, cookies) as answer:
             if not answer.is_page:
                 return Located(url, answer.total)
-            page, shown = _read(answer), answer.url
+            page, shown = _parsed(read_page(answer)), answer.url
         target = page.target()
         if target is None:
             raise RefusedError(_reason(page, shown))
@@ -60,17 +64,32 @@ def locate(url: str, timeout_seconds: float, cookies: CookieJar | None = None) -
     raise RefusedError("one page led to another, and none to the file")
 
 
-def _read(answer: Answer) -> _Page:
+def read_page(answer: Answer) -> str:
+    """The text of the page that answered. Raises RefusedError for a very long one, and LostError."""
     content = b""
     for block in answer.blocks():
         content += block
         if len(content) > _MAX_PAGE_BYTES:
             raise RefusedError("a very long web page came instead of the file")
-    page = _Page()
+    return content.decode("utf-8", errors="replace")
+
+
+def parse(page: HTMLParser, text: str) -> None:
+    """Let `page` take in a page's text."""
     with suppress(AssertionError):  # the parser's, at "<![" without a name: what came before it counts
-        page.feed(content.decode("utf-8", errors="replace"))
+        page.feed(text)
         page.close()
+
+
+def _parsed(text: str) -> _Page:
+    page = _Page()
+    parse(page, text)
     return page
+
+
+def refusal(text: str, url: str) -> str:
+    """Why the page `text`, which came from `url`, is not what was asked for: in its own words where it has some."""
+    return _reason(_parsed(text), url)
 
 
 def _reason(page: _Page, url: str) -> str:

@@ -19,6 +19,7 @@ from splashbench.cache import cache_folder
 from splashbench.download.archive import ArchiveSource, note_path, obtain_archive
 from splashbench.download.fetch import PATIENT, Patience, alone, require_room
 from splashbench.download.meter import Meter
+from splashbench.download.neurofluid_files import scene_named
 from splashbench.download.unpacking import (
     MESHES,
     VARIANTS,
@@ -28,7 +29,7 @@ from splashbench.download.unpacking import (
 )
 from splashbench.errors import SplashbenchError
 from splashbench.files import list_files, read_model, read_plain, require_folder_place, write_model, write_text
-from splashbench.manifest import load_archive, load_comparison, load_scenes
+from splashbench.manifest import load_archive, load_scenes
 from splashbench.scene import Scene
 from splashbench.scene.container import read_mesh
 from splashbench.scene.inspection import check_scene
@@ -39,7 +40,6 @@ _ATTRIBUTION = "ATTRIBUTION.txt"
 # In the cache folder: where the scenes were put last.
 _REMEMBERED = "scenes_folder.txt"
 _MAX_PATH_BYTES = 4096
-_NEUROFLUID = ("watersphere", "watercube", "honeycone", "neurofluid")
 
 
 class CheckedScene(BaseModel):
@@ -81,22 +81,14 @@ def require_names(names: Sequence[str]) -> list[str]:
     for name in names:
         if name in known:
             continue
-        if name.lower() in _NEUROFLUID:
-            raise SplashbenchError(_neurofluid_text())
+        if name.lower() == "neurofluid" or scene_named(name):
+            raise SplashbenchError(
+                "NeuroFluid's scenes are in another place; `splashbench download neurofluid` has them"
+            )
         near = difflib.get_close_matches(name, known, n=1)
         hint = f", did you mean {near[0]!r}?" if near else "; there are bowl_001 to bowl_017 and tank_001 to tank_003"
         raise SplashbenchError(f"the release has no scene {name!r}{hint}")
     return [name for name in known if not names or name in names]
-
-
-def _neurofluid_text() -> str:
-    listed = any(facts.dataset == "NeuroFluid" for facts in load_comparison())
-    assert listed
-    return (
-        "NeuroFluid's scenes are in another archive, and data_manifest/ states no address of it: fetch them from where "
-        "their authors say (github.com/syguan96/NeuroFluid), and give their folders to `splashbench benchmark run "
-        "OUT --scenes` as they are"
-    )
 
 
 def download_scenes(
@@ -180,46 +172,61 @@ def _unpack(
 def _checked(
     out: Path, wanted: Sequence[tuple[str, str]], made: set[tuple[str, str]], again: bool, tell: Callable[[str], None]
 ) -> list[SceneReport]:
-    """A report of every scene. Those that were checked are not read again while they have as many files and bytes."""
-    path, reports = out / STATE_FILE, []
-    state = read_model(path, _State) if path.is_file() else _State()
     variant_of = {folder: variant for variant, folder in VARIANTS.items()}
+    reports = []
     for number, (folder, name) in enumerate(wanted, 1):
-        place, key = out / folder / name, f"{folder}/{name}"
-        listing = list_files(place)
-        known = state.scenes.get(key)
-        size = (len(listing.names), listing.bytes)
-        if known is None or again or (folder, name) in made or (known.files, known.bytes) != size:
-            tell(f"checking {key} ({number} of {len(wanted)})")
-            known = CheckedScene(files=size[0], bytes=size[1], faults=[*listing.faults, *check_scene(place)])
-            state.scenes[key] = known
-            write_model(path, state)
         mesh = out / MESHES / f"{name}.glb"
-        report = SceneReport(
-            name=name,
-            variant=variant_of[folder],
-            folder=place,
+        report = check_downloaded(
+            out,
+            f"{folder}/{name}",
             made=(folder, name) in made,
-            frames=0,
-            times_source="",
-            seconds=0.0,
-            mesh=mesh if mesh.is_file() else None,
-            faults=list(known.faults),
+            again=again,
+            tell=lambda key, number=number: tell(f"checking {key} ({number} of {len(wanted)})"),  # type: ignore[misc]
         )
+        report.variant, report.mesh = variant_of[folder], mesh if mesh.is_file() else None
         if report.mesh is not None:
             try:
                 read_mesh(report.mesh)
             except SplashbenchError as error:
                 report.faults.append(str(error))
-        try:
-            scene = Scene.open(place)
-        except SplashbenchError as error:
-            report.faults = report.faults or [str(error)]
-        else:
-            report.frames, report.times_source = scene.n_frames, scene.times_source
-            report.seconds = float(scene.times[-1] - scene.times[0])
         reports.append(report)
     return reports
+
+
+def check_downloaded(out: Path, key: str, *, made: bool, again: bool, tell: Callable[[str], None]) -> SceneReport:
+    """Check the scene at `out`/`key`, unless it was checked and has as many files and bytes as then.
+
+    made: whether it was unpacked now; again: check it in any case; tell: is given `key` where it is checked.
+    """
+    path, place = out / STATE_FILE, out / key
+    state = read_model(path, _State) if path.is_file() else _State()
+    listing = list_files(place)
+    known = state.scenes.get(key)
+    size = (len(listing.names), listing.bytes)
+    if known is None or again or made or (known.files, known.bytes) != size:
+        tell(key)
+        known = CheckedScene(files=size[0], bytes=size[1], faults=[*listing.faults, *check_scene(place)])
+        state.scenes[key] = known
+        write_model(path, state)
+    report = SceneReport(
+        name=place.name,
+        variant="",
+        folder=place,
+        made=made,
+        frames=0,
+        times_source="",
+        seconds=0.0,
+        mesh=None,
+        faults=list(known.faults),
+    )
+    try:
+        scene = Scene.open(place)
+    except SplashbenchError as error:
+        report.faults = report.faults or [str(error)]
+    else:
+        report.frames, report.times_source = scene.n_frames, scene.times_source
+        report.seconds = float(scene.times[-1] - scene.times[0])
+    return report
 
 
 def _write_attribution(out: Path) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from splashbench.download.archive import MAX_ARCHIVE_BYTES
 from splashbench.download.meter import megabytes
@@ -89,28 +89,49 @@ class SceneArchive:
         return place
 
     def _copy(self, entry: zipfile.ZipInfo, target: Path, seen: Callable[[int], None]) -> None:
-        written = 0
-        try:
-            with self._zip.open(entry) as source, target.open("xb") as stream:
-                while block := source.read(_BLOCK):
-                    written += len(block)
-                    if written > entry.file_size:
-                        raise zipfile.BadZipFile("it is longer than the archive says")
-                    stream.write(block)
-                    seen(len(block))
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-            raise self._damaged(entry, str(error) or type(error).__name__) from None
-        except OSError as error:
-            raise_if_disk_full(target, error)
-            raise
-        if written != entry.file_size:
-            raise self._damaged(entry, f"it has {written} of {entry.file_size} bytes")
+        copy_entry(self.path, self._zip, entry, target, seen)
 
-    def _damaged(self, entry: zipfile.ZipInfo, reason: str) -> SplashbenchError:
-        return SplashbenchError(
-            f"{self.path}: {_shown(entry.filename)} is damaged ({one_line(reason)}); remove the archive, and fetch it "
-            "again"
-        )
+
+def copy_entry(
+    path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path, seen: Callable[[int], None]
+) -> None:
+    """Write an entry of the zip archive `path` to `target`, which is new. seen: is told the bytes of each block.
+
+    Raises SplashbenchError where the entry is damaged.
+    """
+    try:
+        with archive.open(entry) as source:
+            copy_stream(source, target, entry.file_size, seen)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise damaged(path, entry.filename, str(error) or type(error).__name__) from None
+
+
+def copy_stream(source: IO[bytes], target: Path, size: int, seen: Callable[[int], None]) -> None:
+    """Write `size` bytes of `source`, which has no more, to `target`, which is new.
+
+    Raises ValueError for another length, and DiskFullError.
+    """
+    written = 0
+    try:
+        with target.open("xb") as stream:
+            while block := source.read(_BLOCK):
+                written += len(block)
+                if written > size:
+                    raise ValueError("it is longer than the archive says")
+                stream.write(block)
+                seen(len(block))
+    except OSError as error:
+        raise_if_disk_full(target, error)
+        raise
+    if written != size:
+        raise ValueError(f"it has {written} of {size} bytes")
+
+
+def damaged(path: Path, name: str, reason: str) -> SplashbenchError:
+    """The error for a damaged file `name` of the archive `path`."""
+    return SplashbenchError(
+        f"{path}: {shown(name)} is damaged ({one_line(reason)}); remove the archive, and fetch it again"
+    )
 
 
 @contextmanager
@@ -118,6 +139,16 @@ def open_archive(path: Path) -> Iterator[SceneArchive]:
     """Yield the archive `path`, whose entries have been checked; nothing is written.
 
     Raises SplashbenchError for what is no zip archive, is damaged, or holds what no release would.
+    """
+    with open_zip(path) as (archive, size):
+        yield SceneArchive(Path(path), archive, _contents(Path(path), archive.infolist(), size))
+
+
+@contextmanager
+def open_zip(path: Path) -> Iterator[tuple[zipfile.ZipFile, int]]:
+    """Yield the zip archive `path` and its bytes. Its list of entries has been checked, the entries have not.
+
+    Raises SplashbenchError for what is no zip archive or damaged, or lists more than a release does.
     """
     path = Path(path)
     with open_plain(path, MAX_ARCHIVE_BYTES) as (stream, size):
@@ -127,7 +158,12 @@ def open_archive(path: Path) -> Iterator[SceneArchive]:
         except (zipfile.BadZipFile, ValueError, NotImplementedError, OverflowError, OSError, struct.error) as error:
             raise SplashbenchError(f"{path} is no whole zip archive ({one_line(str(error))}); fetch it again") from None
         with archive:
-            yield SceneArchive(path, archive, _contents(path, archive.infolist(), size))
+            entries = archive.infolist()
+            if len(entries) > MAX_ENTRIES:
+                raise SplashbenchError(f"{path} lists {len(entries)} files; the release has no more than {MAX_ENTRIES}")
+            if sum(entry.compress_size for entry in entries) > size:
+                raise SplashbenchError(f"{path} holds files that lie over each other; fetch it again")
+            yield archive, size
 
 
 def _check_list(path: Path, stream: BinaryIO, size: int) -> None:
@@ -165,10 +201,6 @@ def _long_record(stream: BinaryIO, place: int) -> tuple[int, ...] | None:
 
 
 def _contents(path: Path, entries: Sequence[zipfile.ZipInfo], size: int) -> Contents:
-    if len(entries) > MAX_ENTRIES:
-        raise SplashbenchError(f"{path} lists {len(entries)} files; the release has no more than {MAX_ENTRIES}")
-    if sum(entry.compress_size for entry in entries) > size:
-        raise SplashbenchError(f"{path} holds files that lie over each other; fetch it again")
     known, contents = load_scenes(), Contents()
     for entry in entries:
         if entry.is_dir():
@@ -185,22 +217,26 @@ def _contents(path: Path, entries: Sequence[zipfile.ZipInfo], size: int) -> Cont
             contents.others.append(name)
             continue
         if taken:
-            raise SplashbenchError(f"{path} holds {_shown(name)} twice; fetch it again")
-        fault = _fault(entry, size)
+            raise SplashbenchError(f"{path} holds {shown(name)} twice; fetch it again")
+        fault = entry_fault(entry, size)
         if fault:
-            raise SplashbenchError(f"{path}: {_shown(name)} {fault}; nothing was unpacked")
+            raise SplashbenchError(f"{path}: {shown(name)} {fault}; nothing was unpacked")
     listed = [*(entry for scene in contents.scenes.values() for entry in scene.values()), *contents.meshes.values()]
-    total = sum(entry.file_size for entry in listed)
-    if total > max(MAX_GROWTH * size, _SMALL):
-        raise SplashbenchError(
-            f"{path} has {megabytes(size)} and unpacks to {megabytes(total)}, as no release does; nothing was unpacked"
-        )
+    require_growth(path, size, sum(entry.file_size for entry in listed))
     if not contents.scenes:
         raise SplashbenchError(f"{path} holds no scene of the release ({', '.join(VARIANTS.values())}); give another")
     return contents
 
 
-def _fault(entry: zipfile.ZipInfo, archive_bytes: int) -> str:
+def require_growth(path: Path, size: int, total: int) -> None:
+    """Raise SplashbenchError where the archive `path` of `size` bytes unpacks to more than a release does."""
+    if total > max(MAX_GROWTH * size, _SMALL):
+        raise SplashbenchError(
+            f"{path} has {megabytes(size)} and unpacks to {megabytes(total)}, as no release does; nothing was unpacked"
+        )
+
+
+def entry_fault(entry: zipfile.ZipInfo, archive_bytes: int) -> str:
     """Why an entry whose name is in the layout is not unpacked; empty where it is."""
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind not in (0, stat.S_IFREG):
@@ -211,15 +247,21 @@ def _fault(entry: zipfile.ZipInfo, archive_bytes: int) -> str:
         return "is packed in a way that the release does not use"
     if not 0 <= entry.header_offset < archive_bytes:
         return "lies outside the archive"
-    largest = _LARGEST[Path(entry.filename).suffix]
-    if entry.file_size > largest:
-        return f"has {entry.file_size} bytes, more than {largest}"
+    if fault := size_fault(entry.filename, entry.file_size):
+        return fault
     if entry.file_size > _SMALL and entry.file_size > _TIGHTEST * max(1, entry.compress_size):
         return f"is packed {entry.file_size // max(1, entry.compress_size)} times, more than {_TIGHTEST}"
     return ""
 
 
-def _shown(name: str) -> str:
+def size_fault(name: str, size: int) -> str:
+    """Why a file of a scene is larger than its kind ever is; empty where it is not."""
+    largest = _LARGEST[Path(name).suffix]
+    return f"has {size} bytes, more than {largest}" if size > largest else ""
+
+
+def shown(name: str) -> str:
+    """A name of a stranger's archive as a line shows it."""
     return one_line(name)[:120]
 
 

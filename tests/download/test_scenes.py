@@ -403,7 +403,7 @@ def test_names_that_are_no_scene() -> None:
     assert require_names(["tank_001", "bowl_003"]) == ["bowl_003", "tank_001"]
     with pytest.raises(SplashbenchError, match="no scene 'bowl_01', did you mean"):
         require_names(["bowl_01"])
-    with pytest.raises(SplashbenchError, match=r"data_manifest/ states no address .* benchmark run OUT --scenes"):
+    with pytest.raises(SplashbenchError, match="splashbench download neurofluid"):
         require_names(["WaterSphere"])
 
 
