@@ -51,7 +51,7 @@ NeuroFluid's scenes are fetched by `splashbench download neurofluid`.
 _NEUROFLUID = """
 The authors of NeuroFluid share a folder of a public drive (data_manifest/neurofluid.json); they state no licence. How
 the scenes lie in it is not documented. So every file that may belong to a wanted scene is fetched into DIR/neurofluid,
-and what has the layout of these scenes is unpacked to DIR/NAME: from folders, zip and tar archives. Nothing else is,
+and what has the layout of these scenes is unpacked to DIR/NAME: from folders and zip archives. Nothing else is,
 pickles above all. Size and SHA-256 of each file are noted in DIR/neurofluid.json when it first comes, and verified
 after. An interrupted download goes on where it stopped, and scenes that are there stay. A status of 1 says that a scene
 has a fault. Where the drive refuses, fetch the scenes with a browser, and give folders or archives by --from.
@@ -131,7 +131,7 @@ def _register_neurofluid(actions: argparse._SubParsersAction) -> None:
         default=[],
         dest="by_hand",
         metavar="PATH",
-        help="take these folders and archives (zip, tar); no network is needed",
+        help="take these folders and zip archives; no network is needed",
     )
     parser.add_argument("--check", action="store_true", help="check scenes again that were checked before")
 
@@ -193,7 +193,14 @@ def scenes(arguments: argparse.Namespace) -> int:
 def neurofluid(arguments: argparse.Namespace) -> int:
     """Handle `splashbench download neurofluid`."""
     from splashbench.download.neurofluid import download_neurofluid
+    from splashbench.manifest import load_neurofluid
 
+    # One word, or DIR behind --from, which takes it for one more source.
+    if not arguments.names and str(arguments.out).lower() in [name.lower() for name in load_neurofluid().scenes]:
+        arguments.usage_error(
+            f"{arguments.out} is a scene; DIR comes behind the names, and before --from (a folder of this name: "
+            f"{arguments.out.absolute()})"
+        )
     try:
         reports = download_neurofluid(
             arguments.out, arguments.names, arguments.by_hand, tell=say, check_again=arguments.check

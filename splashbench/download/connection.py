@@ -104,6 +104,8 @@ def ask(
             raise _status_fault(error, offset) from None
     except (OSError, http.client.HTTPException) as error:
         raise _fault(error) from None
+    except ValueError:  # what it leads to cannot be read as an address
+        raise RefusedError("it leads to what is no address") from None
     with response:
         yield _answer(response, offset)
 

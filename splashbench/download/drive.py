@@ -21,6 +21,8 @@ _MAX_PAGE_BYTES = 1 << 20
 _MAX_WORDS = 300
 # A page may lead to the next one; more than this is a circle.
 _MOST_PAGES = 3
+# Signs "<" of a page without ">".
+_MOST_OPEN = 1000
 _FORM = "download-form"
 # Classes of the paragraphs in which the drive says what is wrong.
 _FAULTS = ("uc-error-subcaption", "uc-error-caption")
@@ -54,11 +56,15 @@ def locate(url: str, timeout_seconds: float, cookies: CookieJar | None = None) -
             if not answer.is_page:
                 return Located(url, answer.total)
             page, shown = _parsed(read_page(answer)), answer.url
-        target = page.target()
-        if target is None:
+        try:
+            target = page.target()
+            following = None if target is None else urljoin(shown, target)
+            allowed = following is not None and may_lead(shown, following)
+        except ValueError:
+            raise RefusedError("its page leads to what is no address") from None
+        if following is None:
             raise RefusedError(_reason(page, shown))
-        following = urljoin(shown, target)
-        if not may_lead(shown, following):
+        if not allowed:
             raise RefusedError(f"it leads to {one_line(following)[:_MAX_WORDS]}, which may not be followed")
         url = following
     raise RefusedError("one page led to another, and none to the file")
@@ -75,7 +81,9 @@ def read_page(answer: Answer) -> str:
 
 
 def parse(page: HTMLParser, text: str) -> None:
-    """Let `page` take in a page's text."""
+    """Let `page` take in a page's text. Raises RefusedError for one that no browser would make sense of."""
+    if text.count("<") > text.count(">") + _MOST_OPEN:  # the parser goes back to each that is not closed
+        raise RefusedError("what came is no web page")
     with suppress(AssertionError):  # the parser's, at "<![" without a name: what came before it counts
         page.feed(text)
         page.close()

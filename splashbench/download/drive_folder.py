@@ -166,7 +166,9 @@ class _Listing(HTMLParser):
         self._end()
 
     def _end(self) -> None:
-        name = " ".join((self._title or self._text).split())[:_MAX_NAME]
+        name = " ".join((self._title or self._text).split())
+        if len(name) > _MAX_NAME:  # the end tells the kind
+            name = name[: _MAX_NAME - 20] + name[-20:]
         if self._found is not None and name:
             self.entries.append(_Entry(name, *self._found))
         self._found, self._text, self._title, self._in_title = None, "", "", False

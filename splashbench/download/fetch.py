@@ -92,6 +92,8 @@ def fetch(
     require_file_place(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(f"{target.name}.part")
+    if part.is_symlink():  # what it leads to is not this download's
+        part.unlink()
     while True:
         try:
             continued = _Download(file, part, patience, locate, cookies).run()

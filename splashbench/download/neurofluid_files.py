@@ -1,4 +1,4 @@
-"""NeuroFluid's scenes out of whatever they come in: folders, zip and tar archives, or several of them.
+"""NeuroFluid's scenes out of whatever they come in: folders, zip archives, or several of them.
 
 How the authors packed them is not documented. What is known is a scene's own layout, view_N/..., and that a folder or
 an archive above it bears the scene's name. So both are looked for; everything else, pickles above all, is left out.
@@ -6,26 +6,17 @@ an archive above it bears the scene's name. So both are looked for; everything e
 
 from __future__ import annotations
 
-import bz2
-import gzip
-import lzma
 import re
-import tarfile
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
 
 from splashbench.download.archive import MAX_ARCHIVE_BYTES
 from splashbench.download.unpacking import (
-    MAX_ENTRIES,
-    MAX_GROWTH,
     copy_entry,
     copy_stream,
-    damaged,
     entry_fault,
     open_zip,
     require_growth,
@@ -36,17 +27,33 @@ from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import list_files, open_plain
 from splashbench.manifest import load_neurofluid
 
-#: Names that an archive may end in.
-ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
+ARCHIVE = ".zip"
+# Archives that are not read here.
+_OTHERS = re.compile(r"\.(tar|tgz|tar\.\w{2,4}|7z|rar|gz|bz2|xz)", re.IGNORECASE)
 _WORD = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
-_IN_SCENE = re.compile(rf"view_\d{{1,6}}/(?:transforms_(?:train|test)\.json|(?:{_WORD}/){{0,4}}{_WORD}\.(?:png|npz))")
-_VIEW = re.compile(r"view_\d{1,6}")
-# A header of a tar archive that is read at once; real ones have some hundred bytes.
-_MOST_AT_ONCE = 4 << 20
-# What reading damaged bytes raises, and what then becomes of it.
-_UNREADABLE = (zlib.error, lzma.LZMAError, EOFError, OSError, ValueError)
-_DAMAGE = (tarfile.TarError, ValueError)
+_IN_SCENE = re.compile(
+    rf"view_[0-9]{{1,6}}/(?:transforms_(?:train|test)\.json|(?:{_WORD}/){{0,4}}{_WORD}\.(?:png|npz))"
+)
+_VIEW = re.compile(r"view_[0-9]{1,6}")
 Seen = Callable[[int], None]
+
+
+class _Stem(str):
+    """The name of an archive without its end: it may say which scene, and is no folder."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that is or may hold files of scenes. parts: the names that lead to it, those that tell the scene first.
+
+    named: whether the user named this very file.
+    """
+
+    path: Path
+    parts: tuple[str, ...]
+    named: bool = False
 
 
 def scene_named(text: str) -> str | None:
@@ -57,7 +64,12 @@ def scene_named(text: str) -> str | None:
 
 def is_archive(name: str) -> bool:
     """Whether a file's name is that of an archive which can be read."""
-    return name.lower().endswith(ARCHIVES)
+    return name.lower().endswith(ARCHIVE)
+
+
+def is_other_archive(name: str) -> bool:
+    """Whether a file's name is that of an archive which cannot be read here."""
+    return any(_OTHERS.fullmatch(name[at:]) for at in range(len(name)) if name[at] == ".")
 
 
 def place_in_scene(parts: Sequence[str]) -> tuple[str, str, str] | None:
@@ -72,7 +84,7 @@ def place_in_scene(parts: Sequence[str]) -> tuple[str, str, str] | None:
     scene = next((name for part in reversed(parts[:first]) if (name := scene_named(part))), None)
     if scene is None or _IN_SCENE.fullmatch(inner) is None or ".." in inner:
         return None
-    return scene, "/".join(parts[:first]), inner
+    return scene, "/".join(part for part in parts[:first] if not isinstance(part, _Stem)), inner
 
 
 @dataclass
@@ -82,6 +94,7 @@ class Found:
     root: str
     bytes: int = 0
     paths: dict[str, Callable[[Path, Seen], None]] = field(default_factory=dict)
+    taken: dict[str, str] = field(default_factory=dict)  # files and folders, in small letters, and what they are
 
 
 class Gathered:
@@ -89,6 +102,7 @@ class Gathered:
 
     def __init__(self, wanted: Sequence[str]) -> None:
         self.scenes: dict[str, Found] = {}
+        self.nested: list[str] = []  # archives within archives, and such as are not read
         self._wanted = set(wanted)
 
     def belongs(self, parts: Sequence[str]) -> tuple[str, str, str] | None:
@@ -109,8 +123,11 @@ class Gathered:
                 f"{source} holds {scene} twice, as {shown(found.root)!r} and {shown(root)!r}; give the folder of one "
                 "by --from"
             )
-        if inner in found.paths:
-            raise SplashbenchError(f"{source} holds {shown(name)} twice; fetch it again")
+        folders = [inner[:at] for at, letter in enumerate(inner) if letter == "/"]
+        clash = [each for each in folders if found.taken.setdefault(each.lower(), "folder") != "folder"]
+        if clash or inner.lower() in found.taken:
+            raise SplashbenchError(f"{source}: {shown(name)} of {scene} is there twice; give one of both by --from")
+        found.taken[inner.lower()] = "file"
         found.paths[inner] = write
         found.bytes += size
 
@@ -123,43 +140,55 @@ class Gathered:
             write(target, seen)
 
 
-@contextmanager
-def gathered(places: Sequence[Path], wanted: Sequence[str]) -> Iterator[Gathered]:
-    """Yield what the folders and archives `places` hold of the scenes `wanted`; nothing is written.
+def sources_in(places: Sequence[Path], tell: Callable[[str], None]) -> list[Source]:
+    """The files of the folders and archives `places`, as somebody fetched them.
 
-    Raises SplashbenchError for what is no folder and no archive, is damaged, or is no release's.
+    Raises SplashbenchError for what is no folder and no zip archive.
+    """
+    found: list[Source] = []
+    for place in {Path(each).resolve(): Path(each) for each in places}.values():
+        if place.is_dir():
+            # A scene's own folder may be given: its name counts, by whichever name.
+            name = place.absolute().name
+            name = name if scene_named(name) else place.resolve().name
+            listing = list_files(place)
+            if listing.faults:
+                tell(f"left out: {len(listing.faults)} of {place}, such as: {one_line(listing.faults[0])}")
+            found += [Source(place / each, (name, *PurePosixPath(each).parts)) for each in listing.names]
+        elif place.is_file() and is_archive(place.name):
+            found.append(Source(place, (place.name,), named=True))
+        else:
+            what = "neither a folder nor a zip archive" if place.exists() else "not there"
+            raise SplashbenchError(f"{place} is {what}; give zip archives, or the folder of what you unpacked")
+    return found
+
+
+@contextmanager
+def gathered(sources: Sequence[Source], wanted: Sequence[str], tell: Callable[[str], None]) -> Iterator[Gathered]:
+    """Yield what `sources` hold of the scenes `wanted`; nothing is written.
+
+    Archives that cannot be read are told and left out, unless they were named. Raises SplashbenchError for those, and
+    for files that no release has.
     """
     result = Gathered(wanted)
     with ExitStack() as stack:
-        for place in map(Path, places):
-            if place.is_dir():
-                # A scene's own folder may be given: its name counts.
-                for name in list_files(place).names:
-                    parts = (place.resolve().name, *PurePosixPath(name).parts)
-                    if is_archive(name):
-                        _add_archive(result, stack, place / name, (*parts[:-1], _stem(parts[-1])))
-                    elif (found := result.belongs(parts)) is not None:
-                        path = place / name
-                        result.add(found, path.stat().st_size, _copier(path), place, name)
-            elif place.is_file() and is_archive(place.name):
-                _add_archive(result, stack, place, (_stem(place.name),))
-            else:
-                what = "neither a folder nor an archive" if place.exists() else "not there"
-                raise SplashbenchError(f"{place} is {what}; give what was downloaded ({', '.join(ARCHIVES)})")
+        for source in sources:
+            if is_archive(source.path.name):
+                _add_zip(result, stack, source, tell)
+            elif (found := result.belongs(source.parts)) is not None:
+                result.add(found, source.path.stat().st_size, _copier(source.path), source.path, "/".join(source.parts))
+            elif is_other_archive(source.path.name):
+                result.nested.append(str(source.path))
         yield result
 
 
-def _stem(name: str) -> str:
-    ending = max((each for each in ARCHIVES if name.lower().endswith(each)), key=len)
-    return name[: -len(ending)]
-
-
-def _parts(above: Sequence[str], name: str) -> tuple[str, ...]:
-    """The path of an entry; above: of the archive. An archive that is a part of several counts for its name only."""
-    inner = PurePosixPath(name).parts
-    if any(scene_named(part) for part in inner if not _VIEW.fullmatch(part)):
-        return inner
-    return (*above, *inner)
+def _parts(source: Source, name: str) -> tuple[str, ...]:
+    """The path of an archive's entry, that of the archive before it."""
+    inner = PurePosixPath(name.replace("\\", "/")).parts
+    stem = _Stem(source.parts[-1][: -len(ARCHIVE)])
+    if inner and inner[0] == stem:  # it holds a folder of its own name
+        return (*source.parts[:-1], *inner)
+    return (*source.parts[:-1], stem, *inner)
 
 
 def _copier(path: Path) -> Callable[[Path, Seen], None]:
@@ -173,105 +202,31 @@ def _copier(path: Path) -> Callable[[Path, Seen], None]:
     return write
 
 
-def _add_archive(result: Gathered, stack: ExitStack, path: Path, above: Sequence[str]) -> None:
-    if path.name.lower().endswith(".zip"):
-        _add_zip(result, stack, path, above)
-    else:
-        _add_tar(result, stack, path, above)
-
-
-def _add_zip(result: Gathered, stack: ExitStack, path: Path, above: Sequence[str]) -> None:
-    archive, size = stack.enter_context(open_zip(path))
-    total = 0
-    for entry in archive.infolist():
-        place = None if entry.is_dir() else result.belongs(_parts(above, entry.filename))
-        if place is None:
-            continue
-        if fault := entry_fault(entry, size):
-            raise SplashbenchError(f"{path}: {shown(entry.filename)} {fault}; nothing was unpacked")
-        total += entry.file_size
-
-        def write(target: Path, seen: Seen, entry: zipfile.ZipInfo = entry) -> None:
-            copy_entry(path, archive, entry, target, seen)
-
-        result.add(place, entry.file_size, write, path, entry.filename)
-    require_growth(path, size, total)
-
-
-class _Bounded:
-    """An unpacked stream that gives no more than some bytes at once, and no more than `most` in all."""
-
-    def __init__(self, stream: IO[bytes], most: int) -> None:
-        self._stream, self._most = stream, most
-
-    def read(self, count: int = -1) -> bytes:
-        if not 0 <= count <= _MOST_AT_ONCE:
-            raise tarfile.ReadError(f"one of its headers has {count} bytes")
-        with _told():
-            return self._stream.read(count)
-
-    def tell(self) -> int:
-        return self._stream.tell()
-
-    def seek(self, position: int, whence: int = 0) -> int:
-        if whence == 0 and position > self._most:
-            raise tarfile.ReadError(f"it unpacks to more than {MAX_GROWTH} times its size, as no release does")
-        with _told():
-            return self._stream.seek(position, whence)
-
-
-@contextmanager
-def _told() -> Iterator[None]:
-    try:
-        yield
-    except _UNREADABLE as error:
-        raise tarfile.ReadError(str(error) or type(error).__name__) from None
-
-
-def _add_tar(result: Gathered, stack: ExitStack, path: Path, above: Sequence[str]) -> None:
-    packed, size = stack.enter_context(open_plain(path, MAX_ARCHIVE_BYTES))
-    most = max(MAX_GROWTH * size, 8 << 20)
-    unpacked = _unpacked(stack, packed)
-    total = count = 0
-    try:
-        bounded: Any = _Bounded(unpacked, most)
-        archive = stack.enter_context(tarfile.TarFile(fileobj=bounded))
-        for member in archive:
-            count += 1
-            if count > MAX_ENTRIES:
-                raise SplashbenchError(f"{path} lists more than {MAX_ENTRIES} files, as no release does")
-            place = None if member.isdir() else result.belongs(_parts(above, member.name))
-            if place is None:
-                continue
-            if not member.isreg():
-                raise SplashbenchError(f"{path}: {shown(member.name)} is no file; nothing was unpacked")
-            total += member.size
-            require_growth(path, size, total)
-            result.add(place, member.size, _tar_writer(path, archive, member), path, member.name)
-    except _DAMAGE as error:
-        raise SplashbenchError(f"{path} is no whole tar archive ({one_line(str(error))}); fetch it again") from None
-
-
-def _unpacked(stack: ExitStack, packed: IO[bytes]) -> Any:
-    begin = packed.read(6)
-    packed.seek(0)
-    if begin.startswith(b"\x1f\x8b"):
-        return stack.enter_context(gzip.GzipFile(fileobj=packed))
-    if begin.startswith(b"BZh"):
-        return stack.enter_context(bz2.BZ2File(packed))
-    if begin == b"\xfd7zXZ\x00":
-        return stack.enter_context(lzma.LZMAFile(packed))
-    return packed
-
-
-def _tar_writer(path: Path, archive: tarfile.TarFile, member: tarfile.TarInfo) -> Callable[[Path, Seen], None]:
-    def write(target: Path, seen: Seen) -> None:
+def _add_zip(result: Gathered, stack: ExitStack, source: Source, tell: Callable[[str], None]) -> None:
+    path = source.path
+    with ExitStack() as own:
         try:
-            source = archive.extractfile(member)
-            if source is None:
-                raise ValueError("it is no file")
-            copy_stream(source, target, member.size, seen)
-        except _DAMAGE as error:
-            raise damaged(path, member.name, str(error)) from None
+            archive, size = own.enter_context(open_zip(path))
+        except SplashbenchError as error:
+            if source.named:
+                raise
+            tell(f"left out: {one_line(str(error))}")
+            return
+        total = 0
+        for entry in archive.infolist():
+            place = None if entry.is_dir() else result.belongs(_parts(source, entry.filename))
+            if place is None:
+                if is_archive(entry.filename) or is_other_archive(entry.filename):
+                    result.nested.append(f"{path}: {shown(entry.filename)}")
+                continue
+            if fault := entry_fault(entry, size):
+                raise SplashbenchError(f"{path}: {shown(entry.filename)} {fault}; nothing was unpacked")
+            total += entry.file_size
 
-    return write
+            def write(target: Path, seen: Seen, entry: zipfile.ZipInfo = entry) -> None:
+                copy_entry(path, archive, entry, target, seen)
+
+            result.add(place, entry.file_size, write, path, entry.filename)
+        require_growth(path, size, total)
+        if total:  # it is read from later
+            stack.enter_context(own.pop_all())

@@ -267,7 +267,7 @@ def shown(name: str) -> str:
 
 def remove_leftovers(places: Iterable[Path]) -> None:
     """Remove what a killed process left half-made beside `places`. Only while nobody else unpacks there."""
-    for place in places:
-        for path in place.parent.glob(".tmp-*"):
+    for place in (Path(each).absolute() for each in places):  # as the names within a half-made one are told
+        for path in place.parent.resolve().glob(".tmp-*"):
             if is_staged_for(path, place):
                 remove_any(path)
