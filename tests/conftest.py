@@ -12,6 +12,7 @@ from types import FrameType
 import pytest
 
 from splashbench.scene import Scene
+from splashbench.study import stress
 from splashbench.synth.balls import write_balls_scene
 
 
@@ -20,6 +21,14 @@ def _empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What a developer has fetched once, such as LPIPS weights, changes no test."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SPLASHBENCH_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _short_reference() -> Iterator[None]:
+    """The control `nothing` of studies and benchmarks is fitted in 20 steps: nobody looks at it here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stress, "REFERENCE_SETTINGS", {"iterations": 20})
         yield
 
 

@@ -14,11 +14,12 @@ from typing import Any, Literal
 from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Method
 from splashbench.harness.discovery import load_method
+from splashbench.study import stress
 from splashbench.study.plan import StudyPlan, make_plan
 from splashbench.study.spec import Paper, Reference, SceneEntry, StudySpec, StudyVariant
 from splashbench.study.stress import NOTHING, method_labels, parse_method
 
-Budget = Literal["quick", "full"]
+BudgetName = Literal["quick", "full"]
 #: Six methods: the paper's, its three baselines, the hull's points, and the nearest photograph as a yardstick.
 DEFAULT_METHODS = (
     *("splashsplat", "scaffold_4d", "spacetime_gaussians", "deformable_3dgs", "hull_points", "nearest_camera"),
@@ -27,8 +28,6 @@ DEFAULT_METHODS = (
 SHRINKS, NATIVE_SIDE = "longest_side", 16384
 #: The preset of a full budget where it is not a method's first one: the published schedules.
 _FULL = dict.fromkeys(("deformable_3dgs", "spacetime_gaussians", "spacetime_gaussians_lite", "scaffold_4d"), "paper")
-#: On top of the preset of the control `nothing`; tests shorten it.
-REFERENCE_SETTINGS: dict[str, Any] = {}
 _METRICS = (
     *("psnr", "dpsnr_bg", "ssim", "lpips", "miou", "spill", "jitter_error", "sigma_d", "sigma_mu_ratio", "uniformity"),
     *("delta_e", "fit_seconds", "render_fps", "peak_memory_bytes", "storage_bytes", "primitives_per_frame"),
@@ -47,7 +46,7 @@ class Entrant:
     native: bool
 
 
-def make_entrants(methods: Sequence[str], budget: Budget) -> list[Entrant]:
+def make_entrants(methods: Sequence[str], budget: BudgetName) -> list[Entrant]:
     """The methods, each METHOD[:PRESET][:KEY=VALUE,...]. Raises SplashbenchError for an unknown one."""
     chosen = [parse_method(text) for text in methods]
     entrants = []
@@ -65,7 +64,7 @@ def make_entrants(methods: Sequence[str], budget: Budget) -> list[Entrant]:
     return entrants
 
 
-def preset_of(method: Method, budget: Budget) -> str:
+def preset_of(method: Method, budget: BudgetName) -> str:
     """The preset that a method has for `budget`: `quick` or the published schedule, else its first one."""
     wanted = "quick" if budget == "quick" else _FULL.get(method.id, "")
     presets = list(method.Config.presets)
@@ -75,7 +74,7 @@ def preset_of(method: Method, budget: Budget) -> str:
 def make_benchmark_plan(
     entrants: Sequence[Entrant],
     scenes: Sequence[str],
-    budget: Budget,
+    budget: BudgetName,
     *,
     seeds: Sequence[int] = (0,),
     device: str = "cpu",
@@ -84,7 +83,7 @@ def make_benchmark_plan(
     """The runs of `entrants` on `scenes`, and of the control `nothing` on each."""
     nothing = load_method(NOTHING)
     settings = {SHRINKS: NATIVE_SIDE} if SHRINKS in nothing.Config.model_fields else {}
-    settings |= REFERENCE_SETTINGS
+    settings |= stress.REFERENCE_SETTINGS
     paper_names = set(DEFAULT_METHODS[:4])
     spec = StudySpec(
         name=f"benchmark_{budget}",

@@ -140,7 +140,7 @@ def stress(arguments: argparse.Namespace) -> int:
     from splashbench.scene import Scene
     from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed
     from splashbench.study.job import Store
-    from splashbench.study.spending import Budget, by_uncertainty
+    from splashbench.study.spending import StudyBudget, by_uncertainty
     from splashbench.study.stress import make_stress_plan
     from splashbench.study.stress_report import write_stress_report
     from splashbench.study.thinning import thinned
@@ -176,7 +176,7 @@ def stress(arguments: argparse.Namespace) -> int:
         pictures=True,
     )
     if arguments.budget:
-        options.order = by_uncertainty(planned, store, Budget(60 * arguments.budget))
+        options.order = by_uncertainty(planned, store, StudyBudget(60 * arguments.budget))
     tally = carry_out_plan(planned.plan, arguments.out, options)
     files = write_stress_report(planned, store, arguments.out, _stress_command(arguments))
     say(f"{tally.made} runs made" + (f", {tally.reused} reused" if tally.reused else ""))

@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.study.capacity_report import find_knees, knee_text, write_capacity_report
     from splashbench.study.execution import ExecutionOptions, carry_out_plan
     from splashbench.study.job import Store
-    from splashbench.study.spending import Budget
+    from splashbench.study.spending import StudyBudget
 
     capacity = make_capacity_plan(
         arguments.method,
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         training=True,
     )
     if arguments.budget:
-        options.order = smallest_first(capacity, store, Budget(60 * arguments.budget))
+        options.order = smallest_first(capacity, store, StudyBudget(60 * arguments.budget))
     tally = carry_out_plan(plan, arguments.out, options)
     files = write_capacity_report(capacity, store, arguments.out, _command(arguments))
     knees = find_knees(capacity, store)

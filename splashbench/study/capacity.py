@@ -22,7 +22,7 @@ from splashbench.study.knee import Rung
 from splashbench.study.ladder import Ladder, ladder_of
 from splashbench.study.plan import PlannedRun, StudyPlan, make_plan
 from splashbench.study.spec import SceneEntry, StudySpec, StudyVariant
-from splashbench.study.spending import Budget
+from splashbench.study.spending import StudyBudget
 from splashbench.study.table import StudyRun
 from splashbench.study.training_views import TRAINING_METRICS
 
@@ -86,7 +86,7 @@ def make_capacity_plan(
 
 
 def smallest_first(
-    capacity: CapacityPlan, store: Store, budget: Budget
+    capacity: CapacityPlan, store: Store, budget: StudyBudget
 ) -> Callable[[Sequence[PlannedRun]], Iterator[PlannedRun]]:
     """What orders the missing runs rung by rung, and leaves out those that would not end within `budget`.
 

@@ -30,7 +30,7 @@ class Cell:
 
 
 @dataclass
-class Budget:
+class StudyBudget:
     """Runs within `seconds`. clock: seconds, from any start."""
 
     seconds: float
@@ -45,7 +45,7 @@ class Budget:
 
 
 def by_uncertainty(
-    stress: StressPlan, store: Store, budget: Budget
+    stress: StressPlan, store: Store, budget: StudyBudget
 ) -> Callable[[Sequence[PlannedRun]], Iterator[PlannedRun]]:
     """What orders the missing runs of `stress`, and ends once another would not end within `budget`.
 

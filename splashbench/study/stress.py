@@ -26,6 +26,8 @@ from splashbench.submission.withheld import scored_timesteps
 
 #: The control that shows what a recording gives without any liquid.
 NOTHING = "nothing"
+#: On top of the preset of that control; tests shorten it.
+REFERENCE_SETTINGS: dict[str, Any] = {}
 #: What stability is told by, the first one first; all of them are tabulated.
 METRICS = ("miou", "psnr", "lpips")
 _AS_RECORDED = "as_recorded"
@@ -97,7 +99,7 @@ def make_stress_plan(
     harms = [harm for harm in wanted if harm not in [other for other, _ in left_out]]
     if not harms:
         raise SplashbenchError(f"none of the harms is left: {left_out[0][1] if left_out else 'give some severities'}")
-    nothing = StudyVariant(name=f"{NOTHING}.{_AS_RECORDED}", method=NOTHING)
+    nothing = StudyVariant(name=f"{NOTHING}.{_AS_RECORDED}", method=NOTHING, settings=REFERENCE_SETTINGS)
     variants = [nothing]
     rows: dict[str, tuple[str, Harm | None]] = {nothing.name: (NOTHING, None)}
     for number, (label, (method, preset, settings)) in enumerate(zip(labels, chosen)):

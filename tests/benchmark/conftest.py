@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from splashbench.benchmark import budgets
 from splashbench.cli.main import main
 from splashbench.download.scenes import download_scenes
 from splashbench.synth.release import imitations, write_release
 
 NAMES = ("bowl_001", "tank_002")
 GREY = f"{Path(__file__).parents[1] / 'study' / 'study_methods.py'}:Grey"
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _short_reference() -> Iterator[None]:
-    """The control `nothing` is fitted in 20 steps: nobody looks at it here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(budgets, "REFERENCE_SETTINGS", {"iterations": 20})
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -40,7 +40,7 @@ def test_a_budget_reaches_the_method_and_stands_in_the_submission(
     thrifty: str, balls_directory: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    run_method(thrifty, balls_directory, out, budget=Budget(seconds=60), timing_frames=0)
+    run_method(thrifty, balls_directory, out, budget=Budget(seconds=60), overrides={"iterations": 20}, timing_frames=0)
     submission = Submission.open(out)
     assert submission.identity.budget == Budget(seconds=60)
     assert [decision.chosen for decision in submission.record.decisions] == ["60 s"]
@@ -60,13 +60,13 @@ def test_what_is_no_budget_is_a_usage_error(option: str, value: str, capsys: pyt
     assert option in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_budget_that_was_not_kept_is_said(
     thrifty: str, balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(seconds: str) -> str:
         out = str(tmp_path / seconds)
-        main(["run", thrifty, str(balls_directory), out, "--budget-seconds", seconds, "--timing-frames=0"])
+        few = ["--set", "iterations=20", "--timing-frames=0"]
+        main(["run", thrifty, str(balls_directory), out, "--budget-seconds", seconds, *few])
         return capsys.readouterr().err
 
     assert "a budget of 0.001 s could not be kept" in run("0.001")

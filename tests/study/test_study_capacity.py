@@ -17,7 +17,7 @@ from splashbench.score.image.fidelity import psnr
 from splashbench.study.capacity import MEAN, capacity_frame, curves, make_capacity_plan, smallest_first
 from splashbench.study.job import RunEntry, Store
 from splashbench.study.ladder import declared_ladder, parse_ladder
-from splashbench.study.spending import Budget
+from splashbench.study.spending import StudyBudget
 
 METHODS = Path(__file__).with_name("study_methods.py")
 GROWING = f"{METHODS}:Growing"
@@ -133,7 +133,7 @@ def test_within_a_budget_small_rungs_come_first_and_too_long_ones_never(balls_di
     capacity = make_capacity_plan(GROWING, [str(balls_directory)], seeds=[0, 1])
     now = [0.0]
     made = []
-    order = smallest_first(capacity, store, Budget(100, clock=lambda: now[0]))
+    order = smallest_first(capacity, store, StudyBudget(100, clock=lambda: now[0]))
     for run in order(capacity.plan.runs):
         rung = capacity.rungs[run.variant.name]
         made.append((rung, run.seed))

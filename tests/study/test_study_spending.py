@@ -12,7 +12,7 @@ import pytest
 
 from splashbench.cli.main import main
 from splashbench.study.job import Store
-from splashbench.study.spending import Budget, Cell, by_uncertainty
+from splashbench.study.spending import Cell, StudyBudget, by_uncertainty
 from splashbench.study.stability import StressRun
 from splashbench.study.stress import make_stress_plan
 from splashbench.study.stress_pages import page_name, summaries
@@ -30,7 +30,7 @@ def simulated(balls_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("splashbench.study.spending._expected", lambda stress, store, run: 10.0)
     now = [0.0]
     made: list[tuple[str, str, int]] = []
-    order = by_uncertainty(plan, Store(tmp_path / "none"), Budget(95, clock=lambda: now[0]))
+    order = by_uncertainty(plan, Store(tmp_path / "none"), StudyBudget(95, clock=lambda: now[0]))
     for run in order([run for run in plan.plan.runs if plan.rows[run.variant.name][0] != "nothing"]):
         label, harm = plan.rows[run.variant.name]
         made.append((label, harm.kind.named() if harm else "", harm.level if harm else 0))
