@@ -84,6 +84,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         help="take alexnet-owt-7be5be79.pth and alex.pth from this folder; no network is needed",
     )
     _register_scenes(actions)
+    _register_neurofluid(actions)
 
 
 def _register_scenes(actions: argparse._SubParsersAction) -> None:
@@ -110,7 +111,6 @@ def _register_scenes(actions: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--url", metavar="URL", help="fetch the archive from a copy at this address")
     parser.add_argument("--check", action="store_true", help="check scenes again that were checked before")
-    _register_neurofluid(actions)
 
 
 def _register_neurofluid(actions: argparse._SubParsersAction) -> None:

@@ -6,7 +6,6 @@ beside it, and held against every later one. What data_manifest/ states goes bef
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from http.cookiejar import CookieJar
@@ -17,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from splashbench.download.connection import LostError, RefusedError
 from splashbench.download.drive import Located, drive_address, locate
-from splashbench.download.fetch import PATIENT, Patience, RemoteFile, fetch
+from splashbench.download.fetch import PATIENT, Patience, RemoteFile, fetch, patiently
 from splashbench.download.meter import megabytes
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_model, sha256_file, write_model
@@ -175,19 +174,8 @@ def _fetched(
 
 
 def patiently_located(url: str, patience: Patience, cookies: CookieJar, tell: Callable[[str], None]) -> Located:
-    """Where the archive is for now. Raises RefusedError, or LostError after as many tries as `patience` has."""
-    wait = patience.wait_seconds
-    for left in range(patience.tries - 1, -1, -1):
-        try:
-            return locate(url, patience.timeout_seconds, cookies)
-        except LostError as lost:
-            if not left:
-                raise
-            pause = max(wait, lost.wait_seconds)
-            tell(f"again in {pause:.0f} s: {lost}")
-            time.sleep(pause)
-            wait *= 2
-    raise LostError("it was not tried")
+    """`locate`, tried as often as `patience` has it. Raises RefusedError or LostError."""
+    return patiently(lambda: locate(url, patience.timeout_seconds, cookies), patience, tell)
 
 
 def by_hand_text(path: Path, source: ArchiveSource) -> str:

@@ -7,16 +7,16 @@ links every entry: a file's link leads to /file/d/ID, a folder's to /drive/folde
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from html.parser import HTMLParser
 from http.cookiejar import CookieJar
 from urllib.parse import urlencode, urlsplit
 
 from splashbench.download.connection import BROWSER_AGENT, LostError, RefusedError, ask
 from splashbench.download.drive import DRIVE, drive_address, parse, read_page, refusal
-from splashbench.download.fetch import PATIENT, Patience
+from splashbench.download.fetch import PATIENT, Patience, patiently
 from splashbench.errors import SplashbenchError, one_line
 
 #: Folders below each other, folders, and files of all of them.
@@ -79,7 +79,8 @@ def list_drive_folder(
     while open_folders:
         path, folder_id = open_folders.pop()
         try:
-            entries = _patiently_listed(folder.listing_address(folder_id), patience, cookies, tell)
+            address = folder.listing_address(folder_id)
+            entries = patiently(partial(_listed, address, patience.timeout_seconds, cookies), patience, tell)
         except (RefusedError, LostError) as error:
             place = f"has the folder {one_line('/'.join(path))}, which " if path else ""
             raise SplashbenchError(f"{folder.page} {place}could not be listed: {error}; {remedy}") from None
@@ -105,26 +106,14 @@ class _Entry:
     is_folder: bool
 
 
-def _patiently_listed(url: str, patience: Patience, cookies: CookieJar, tell: Callable[[str], None]) -> list[_Entry]:
-    wait = patience.wait_seconds
-    for left in range(patience.tries - 1, -1, -1):
-        try:
-            with ask(url, 0, patience.timeout_seconds, cookies, BROWSER_AGENT) as answer:
-                text, shown = (read_page(answer) if answer.is_page else ""), answer.url
-        except LostError as lost:
-            if not left:
-                raise
-            pause = max(wait, lost.wait_seconds)
-            tell(f"again in {pause:.0f} s: {lost}")
-            time.sleep(pause)
-            wait *= 2
-            continue
-        listing = _Listing()
-        parse(listing, text)
-        if not listing.entries and not listing.is_listing:
-            raise RefusedError(refusal(text, shown))
-        return listing.entries
-    raise LostError("it was not tried")
+def _listed(url: str, timeout_seconds: float, cookies: CookieJar) -> list[_Entry]:
+    with ask(url, 0, timeout_seconds, cookies, BROWSER_AGENT) as answer:
+        text, shown = (read_page(answer) if answer.is_page else ""), answer.url
+    listing = _Listing()
+    parse(listing, text)
+    if not listing.entries and not listing.is_listing:
+        raise RefusedError(refusal(text, shown))
+    return listing.entries
 
 
 class _Listing(HTMLParser):

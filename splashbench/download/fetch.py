@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from http.cookiejar import CookieJar
 from pathlib import Path
+from typing import TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -66,6 +67,26 @@ class Patience:
 
 
 PATIENT = Patience()
+Found = TypeVar("Found")
+
+
+def patiently(ask_once: Callable[[], Found], patience: Patience, tell: Callable[[str], None]) -> Found:
+    """What `ask_once` returns; where the connection is lost, after longer and longer waits, of which `tell` says.
+
+    Raises LostError after as many tries as `patience` has, and what else `ask_once` raises.
+    """
+    wait = patience.wait_seconds
+    for left in range(patience.tries - 1, -1, -1):
+        try:
+            return ask_once()
+        except LostError as lost:
+            if not left:
+                raise
+            pause = max(wait, lost.wait_seconds)
+            tell(f"again in {pause:.0f} s: {lost}")
+            time.sleep(pause)
+            wait *= 2
+    raise LostError("it was not tried")
 
 
 def fetch(

@@ -18,6 +18,7 @@ class Meter:
     def __init__(self, name: str, size: int, have: int) -> None:
         self._name, self._size = name, size
         self._first, self._start = have, time.monotonic()
+        self._have = have
         self._bar: Bar | None = None
 
     def show(self, have: int) -> None:
@@ -26,6 +27,11 @@ class Meter:
             self._bar = Bar(self._name)
         if self._bar is not None:
             self._bar.update(have / self._size, self._estimate(have))
+
+    def add(self, count: int) -> None:
+        """Move the bar by `count` bytes."""
+        self._have += count
+        self.show(self._have)
 
     def wait(self, reason: str, seconds: float) -> None:
         """Say why nothing arrives for so many seconds."""

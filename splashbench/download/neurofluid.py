@@ -108,7 +108,7 @@ def download_neurofluid(
                 raise SplashbenchError(f"{out / name} is a file, where a scene belongs; move it away")
         missing = [name for name in chosen if not _is_filled(out / name)]
         if missing:
-            place = ", ".join(map(str, by_hand)) or f"{folder.page}"
+            place = ", ".join(map(str, by_hand)) or folder.page
             sources = given if by_hand else _fetched(out, folder, missing, tell, patience)
             with gathered(sources, missing, tell) as files:
                 _unpack(files, missing, place, out, folder, tell)
@@ -286,17 +286,10 @@ def _unpack(
     total = sum(files.scenes[name].bytes for name in missing)
     require_room(out, total, "the scenes take", "free some space, or name fewer scenes")
     tell(f"unpacking {', '.join(missing)} into {out} ({megabytes(total)})")
-    done = 0
     with closing(Meter("unpacking", max(1, total), 0)) as meter:
-
-        def seen(count: int) -> None:
-            nonlocal done
-            done += count
-            meter.show(done)
-
         for name in missing:
             with atomic_directory(out / name) as staging:
-                files.write(name, staging, seen)
+                files.write(name, staging, meter.add)
 
 
 def _write_attribution(out: Path) -> None:

@@ -155,18 +155,11 @@ def _unpack(
     remedy = "free some space, or name fewer scenes, or one --variant"
     require_room(out, total, "the scenes take", remedy)
     tell(f"unpacking {len(missing)} scenes{f' and {len(meshes)} scans of containers' if meshes else ''} into {out}")
-    done = 0
     with closing(Meter("unpacking", max(1, total), 0)) as meter:
-
-        def seen(count: int) -> None:
-            nonlocal done
-            done += count
-            meter.show(done)
-
         for name in meshes:
-            archive.unpack_mesh(name, out, seen)
+            archive.unpack_mesh(name, out, meter.add)
         for folder, name in missing:
-            archive.unpack_scene(folder, name, out, seen)
+            archive.unpack_scene(folder, name, out, meter.add)
 
 
 def _checked(
