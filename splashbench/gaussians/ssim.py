@@ -25,6 +25,8 @@ from splashbench.parallel import over_range
 _RADIUS = 5
 _SIGMA = 1.5
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
+# An image of fewer pixels is worked on whole. More rows are worked on twice in narrower bands.
+_BAND_PIXELS, _LEAST_ROWS = 1 << 17, 64
 _offsets = np.arange(-_RADIUS, _RADIUS + 1)
 _WINDOW = np.exp(-(_offsets**2) / (2 * _SIGMA**2))
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
@@ -38,14 +40,17 @@ def _add(row: np.ndarray, weight: np.float32, source: np.ndarray) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _blur(image: np.ndarray, padded_row: np.ndarray, out: np.ndarray) -> None:
-    """Both passes of the separable window over [h, w] float32, zero beyond the border; padded_row: [w + 10], zeros."""
-    height, width = image.shape
+def _blur(rows: np.ndarray, first: int, padded_row: np.ndarray, out: np.ndarray) -> None:
+    """Both passes of the separable window, zero beyond `rows` [n, w] float32; padded_row: [w + 10], zeros.
+
+    out: [m, w], the windows around `rows` from number `first` on.
+    """
+    height, width = rows.shape
     inner = padded_row[_RADIUS : _RADIUS + width]
-    for y in range(height):
+    for y in range(out.shape[0]):
         inner[:] = 0
-        for source in range(max(0, y - _RADIUS), min(height, y + _RADIUS + 1)):
-            _add(inner, _WINDOW[source - y + _RADIUS], image[source])
+        for source in range(max(0, first + y - _RADIUS), min(height, first + y + _RADIUS + 1)):
+            _add(inner, _WINDOW[source - first - y + _RADIUS], rows[source])
         row = out[y]
         row[:] = 0
         for tap in range(2 * _RADIUS + 1):
@@ -53,23 +58,36 @@ def _blur(image: np.ndarray, padded_row: np.ndarray, out: np.ndarray) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _blurred_product(a: np.ndarray, b: np.ndarray, product: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
-    """Window over a * b, all [h, w]; product: scratch."""
+def _blurred_product(
+    a: np.ndarray, b: np.ndarray, first: int, product: np.ndarray, row: np.ndarray, out: np.ndarray
+) -> None:
+    """Window over a * b, both [n, w]; product: scratch of as many rows or more. For the others see `_blur`."""
     for y in range(a.shape[0]):
         for x in range(a.shape[1]):
             product[y, x] = a[y, x] * b[y, x]
-    _blur(product, row, out)
+    _blur(product[: a.shape[0]], first, row, out)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _band_rows(height: int, width: int) -> int:
+    """How many rows are worked on at a time: all of a small image; of one of 4K so many that its scratch is small."""
+    return min(height, max(_LEAST_ROWS, _BAND_PIXELS // max(1, width)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _target_moments(image: np.ndarray, mean: np.ndarray, square: np.ndarray, start: int, stop: int) -> None:
     """Windows over the image and its square; all [channels, h, w]."""
     height, width = image.shape[1:]
+    band = _band_rows(height, width)
     row = np.zeros(width + 2 * _RADIUS, np.float32)
-    product = np.empty((height, width), np.float32)
+    product = np.empty((min(height, band + 2 * _RADIUS), width), np.float32)
     for channel in range(start, stop):
-        _blur(image[channel], row, mean[channel])
-        _blurred_product(image[channel], image[channel], product, row, square[channel])
+        for top in range(0, height, band):
+            bottom = min(height, top + band)
+            around = max(0, top - _RADIUS)
+            rows = image[channel, around : min(height, bottom + _RADIUS)]
+            _blur(rows, top - around, row, mean[channel, top:bottom])
+            _blurred_product(rows, rows, top - around, product, row, square[channel, top:bottom])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -83,43 +101,63 @@ def _channels(
     start: int,
     stop: int,
 ) -> None:
-    """SSIM summed over the pixels of each channel, and its derivative by `a`; all but total: [channels, h, w]."""
+    """SSIM summed over the pixels of each channel, and its derivative by `a`; all but total: [channels, h, w].
+
+    In bands of rows: scratch for whole images of 4K would take hundreds of megabytes. The derivative of a band needs
+    the windows within one radius of it, and these the pixels within two.
+    """
     height, width = a.shape[1:]
+    band = _band_rows(height, width)
     one = np.float32(1)
     two = np.float32(2)
     row = np.zeros(width + 2 * _RADIUS, np.float32)
-    product = np.empty((height, width), np.float32)
+    product = np.empty((min(height, band + 4 * _RADIUS), width), np.float32)
     # Windows over a, a^2 and a b; their places are then taken by the derivatives with respect to them.
-    moments = np.empty((3, height, width), np.float32)
-    blurred = np.empty((2, height, width), np.float32)
+    # An array each, and a view of rows for each: these stay contiguous, without which loops are half as fast.
+    reached = min(height, band + 2 * _RADIUS)
+    of_a, of_square = np.empty((reached, width), np.float32), np.empty((reached, width), np.float32)
+    of_product = np.empty((reached, width), np.float32)
+    by_square, by_product = np.empty((band, width), np.float32), np.empty((band, width), np.float32)
     for channel in range(start, stop):
-        first, second = a[channel], b[channel]
-        _blur(first, row, moments[0])
-        _blurred_product(first, first, product, row, moments[1])
-        _blurred_product(first, second, product, row, moments[2])
         subtotal = 0.0
-        for y in range(height):
-            for x in range(width):
-                mean_a, mean_b = moments[0, y, x], mean[channel, y, x]
-                squares = mean_a * mean_a + mean_b * mean_b
-                luminance = two * mean_a * mean_b + _C1
-                structure = two * (moments[2, y, x] - mean_a * mean_b) + _C2
-                by_means = one / (squares + _C1)
-                by_variances = one / (moments[1, y, x] + square[channel, y, x] - squares + _C2)
-                value = luminance * structure * by_means * by_variances
-                subtotal += value
-                moments[0, y, x] = two * mean_b * (
-                    structure - luminance
-                ) * by_means * by_variances - two * mean_a * value * (by_means - by_variances)
-                moments[1, y, x] = -value * by_variances
-                moments[2, y, x] = two * luminance * by_means * by_variances
+        for top in range(0, height, band):
+            bottom = min(height, top + band)
+            low, high = max(0, top - _RADIUS), min(height, bottom + _RADIUS)
+            lowest = max(0, low - _RADIUS)
+            first = a[channel, lowest : min(height, high + _RADIUS)]
+            second = b[channel, lowest : min(height, high + _RADIUS)]
+            means, squares_a, products = of_a[: high - low], of_square[: high - low], of_product[: high - low]
+            _blur(first, low - lowest, row, means)
+            _blurred_product(first, first, low - lowest, product, row, squares_a)
+            _blurred_product(first, second, low - lowest, product, row, products)
+            for y in range(high - low):
+                mean_row, square_row = mean[channel, low + y], square[channel, low + y]
+                row_total = 0.0
+                for x in range(width):
+                    mean_a, mean_b = means[y, x], mean_row[x]
+                    squares = mean_a * mean_a + mean_b * mean_b
+                    luminance = two * mean_a * mean_b + _C1
+                    structure = two * (products[y, x] - mean_a * mean_b) + _C2
+                    by_means = one / (squares + _C1)
+                    by_variances = one / (squares_a[y, x] + square_row[x] - squares + _C2)
+                    value = luminance * structure * by_means * by_variances
+                    row_total += value
+                    means[y, x] = two * mean_b * (
+                        structure - luminance
+                    ) * by_means * by_variances - two * mean_a * value * (by_means - by_variances)
+                    squares_a[y, x] = -value * by_variances
+                    products[y, x] = two * luminance * by_means * by_variances
+                if top <= low + y < bottom:
+                    subtotal += row_total
+            inner, by_a = a[channel, top:bottom], gradient[channel, top:bottom]
+            target = b[channel, top:bottom]
+            _blur(means, top - low, row, by_a)
+            _blur(squares_a, top - low, row, by_square[: bottom - top])
+            _blur(products, top - low, row, by_product[: bottom - top])
+            for y in range(bottom - top):
+                for x in range(width):
+                    by_a[y, x] += two * inner[y, x] * by_square[y, x] + target[y, x] * by_product[y, x]
         total[channel] = subtotal
-        _blur(moments[0], row, gradient[channel])
-        _blur(moments[1], row, blurred[0])
-        _blur(moments[2], row, blurred[1])
-        for y in range(height):
-            for x in range(width):
-                gradient[channel, y, x] += two * first[y, x] * blurred[0, y, x] + second[y, x] * blurred[1, y, x]
 
 
 class SsimTarget:
@@ -164,7 +202,8 @@ class _Ssim(torch.autograd.Function):
         over_range(_channels, len(a), a, target.image, *target.moments, total, gradient)
         if target.weight is not None:
             gradient *= target.weight
-        ctx.gradient = torch.from_numpy(gradient.transpose(1, 2, 0) / np.float32(a.size))
+        gradient /= np.float32(a.size)
+        ctx.gradient = torch.from_numpy(gradient.transpose(1, 2, 0))
         return image.new_tensor(total.sum() / a.size)
 
     @staticmethod

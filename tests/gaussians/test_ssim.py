@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.gaussians.ssim import SsimTarget, ssim
+from splashbench.gaussians.ssim import SsimTarget, _band_rows, ssim, ssim_by_torch
 
 
 def images(height: int = 14, width: int = 17) -> tuple[np.ndarray, np.ndarray]:
@@ -55,3 +55,20 @@ def test_images_of_different_sizes_do_not_compare():
     image, noisy = images()
     with pytest.raises(ValueError, match="another size"):
         ssim(torch.from_numpy(noisy[1:]), SsimTarget(image))
+
+
+# 64 rows at least are a band: the second has a last band of one row, the third one that is all border.
+@pytest.mark.parametrize("size", [(640, 300), (513, 256), (130, 4000), (3, 70_000)])
+def test_images_of_several_bands_of_rows_are_as_torch_has_them_whole(size: tuple[int, int]) -> None:
+    assert _band_rows(*size) < size[0] or size[0] < 64
+    rng = np.random.default_rng(3)
+    image, noisy = (rng.random((*size, 1), dtype=np.float32) for _ in range(2))
+    target = SsimTarget(image)
+    banded, whole = (torch.from_numpy(noisy.copy()).requires_grad_() for _ in range(2))
+    value = ssim(banded, target)
+    expected = ssim_by_torch(whole, torch.from_numpy(target.image))
+    value.backward()
+    expected.backward()
+    assert value.item() == pytest.approx(expected.item(), rel=1e-5)
+    scale = float(whole.grad.abs().max())
+    np.testing.assert_allclose(banded.grad.numpy(), whole.grad.numpy(), atol=1e-4 * scale)
