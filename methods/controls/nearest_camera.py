@@ -25,6 +25,7 @@ class NearestCamera(Method):
 
     id: ClassVar[str] = "nearest_camera"
     title: ClassVar[str] = "control: nearest training view"
+    torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = MethodConfig
     control: ClassVar[bool] = True
 

@@ -39,6 +39,7 @@ class Scaffold4D(GaussianMethod):
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
     version: ClassVar[str] = "3"  # since it starts and penalises volumes as published
+    torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
     mixed: ClassVar[bool] = True
 

@@ -46,6 +46,7 @@ class ScaffoldGS(GaussianMethod):
     id: ClassVar[str] = "scaffold_gs"
     title: ClassVar[str] = "Scaffold-GS, static"
     version: ClassVar[str] = "2"  # since backgrounds are stored in whole steps
+    torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
 
     def fit(self, scene: TrainingScene, config: BackgroundSettings, run: Run) -> Fitted:

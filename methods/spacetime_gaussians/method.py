@@ -56,6 +56,7 @@ class SpacetimeGaussians(GaussianMethod):
     id: ClassVar[str] = "spacetime_gaussians"
     title: ClassVar[str] = "SpacetimeGaussians, full"
     version: ClassVar[str] = "3"  # since `quick` starts with faint Gaussians, as published
+    torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = SpacetimeSettings
     mixed: ClassVar[bool] = True
     full: ClassVar[bool] = True

@@ -179,6 +179,7 @@ class SplashSplat(Method):
     title: ClassVar[str] = "SplashSplat"
     version: ClassVar[str] = VERSION
     budgets: ClassVar[tuple[str, ...]] = ("seconds", "storage_bytes")
+    torch_optim: ClassVar[bool] = False
     Config = SplashSplatConfig
 
     def supports(self, scene: TrainingScene) -> Support:

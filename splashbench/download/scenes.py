@@ -117,7 +117,7 @@ def download_scenes(
     wanted = [(VARIANTS[variant], name) for variant in VARIANTS if variant in variants for name in chosen]
     with alone(out / source.name, tell):
         places = [out / folder / name for folder, name in wanted]
-        notes = (out / STATE_FILE, out / _ATTRIBUTION, note_path(out, source))
+        notes = (out / _ATTRIBUTION, note_path(out, source))
         remove_leftovers([*places, *(out / MESHES / f"{name}.glb" for name in chosen), *notes])
         for place in places:
             if place.exists() and not place.is_dir():
@@ -192,15 +192,19 @@ def check_downloaded(out: Path, key: str, *, made: bool, again: bool, tell: Call
     made: whether it was unpacked now; again: check it in any case; tell: is given `key` where it is checked.
     """
     path, place = out / STATE_FILE, out / key
-    state = read_model(path, _State) if path.is_file() else _State()
+    state = _noted(path)
     listing = list_files(place)
     known = state.scenes.get(key)
     size = (len(listing.names), listing.bytes)
     if known is None or again or made or (known.files, known.bytes) != size:
         tell(key)
         known = CheckedScene(files=size[0], bytes=size[1], faults=[*listing.faults, *check_scene(place)])
-        state.scenes[key] = known
-        write_model(path, state)
+        # Another command may note scenes of its own in the same folder meanwhile, such as NeuroFluid's.
+        with alone(path, lambda _: None):
+            remove_leftovers([path])
+            state = _noted(path)
+            state.scenes[key] = known
+            write_model(path, state)
     report = SceneReport(
         name=place.name,
         variant="",
@@ -220,6 +224,13 @@ def check_downloaded(out: Path, key: str, *, made: bool, again: bool, tell: Call
         report.frames, report.times_source = scene.n_frames, scene.times_source
         report.seconds = float(scene.times[-1] - scene.times[0])
     return report
+
+
+def _noted(path: Path) -> _State:
+    try:
+        return read_model(path, _State) if path.is_file() else _State()
+    except SplashbenchError as error:
+        raise SplashbenchError(f"{error}, or remove it: the scenes are then checked again") from None
 
 
 def _write_attribution(out: Path) -> None:

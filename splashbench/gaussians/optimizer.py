@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from .adam import Adam
+
 # A short fit learns most where rates stay high for long, and has come to rest where they end before it does.
 _SHORT_LAST, _SHORT_HOLD, _SHORT_UNTIL = 0.025, 0.35, 0.75
 # Beside matrices that take Muon's steps; fits whose biases learned as fast by Adam were spoilt at high rates.
@@ -79,8 +81,8 @@ class RowOptimizer:
                 matrices.append({"params": [p for p in parameters if p.ndim == 2], "name": name, "share": share})
                 parameters, share = [p for p in parameters if p.ndim != 2], _BESIDE_MUON
             groups.append({"params": parameters, "name": name, "share": share})
-        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
-        self._optimizers: list[torch.optim.Optimizer] = [self.adam]
+        self.adam = Adam(groups, eps=1e-15)
+        self._optimizers: list[Adam | torch.optim.Optimizer] = [self.adam]
         if matrices:
             self._optimizers.append(
                 torch.optim.Muon(matrices, lr=0.0, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
@@ -101,7 +103,7 @@ class RowOptimizer:
             for group in optimizer.param_groups:
                 group["lr"] = group["share"] * self.rates[group["name"]].at(self.done)
             optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+            optimizer.zero_grad()
         self.step_count += 1
 
     def replace_rows(self, kept: NDArray[np.int64], new: Mapping[str, Tensor]) -> None:

@@ -344,6 +344,9 @@ class Method(ABC):
     Config: ClassVar[type[MethodConfig]] = MethodConfig
     #: What `Run.device` may be; a GPU method lists "cuda" too, and saves what any machine can load.
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
+    #: False where fits use no optimiser of torch.optim: these make PyTorch load its compiler, which takes seconds and
+    #: 70 MB. It is loaded before the clock starts, for all that use PyTorch otherwise.
+    torch_optim: ClassVar[bool] = True
     #: Which limits of `Budget` the method keeps to; with others the user is told that it does not.
     budgets: ClassVar[tuple[str, ...]] = ()
     #: True for the yardsticks that are no reconstructions (methods/controls).

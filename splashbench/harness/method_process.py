@@ -77,7 +77,8 @@ def _fit(request: Request, method: Method, scene: TrainingScene, channel: Channe
     support = method.supports(scene)
     if not support.ok:
         raise Failure(Status.UNSUPPORTED, support.reason or "the method gave no reason")
-    _load_compiler()
+    if method.torch_optim:
+        _load_compiler()
     with Path(request.progress).open("a", encoding="utf-8") as stream:
         run = Run(
             seed=request.seed,

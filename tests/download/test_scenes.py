@@ -23,7 +23,7 @@ from splashbench.download import scenes as module
 from splashbench.download import unpacking
 from splashbench.download.archive import ArchiveSource
 from splashbench.download.fetch import Patience
-from splashbench.download.scenes import download_scenes, remembered_folder, require_names
+from splashbench.download.scenes import STATE_FILE, check_downloaded, download_scenes, remembered_folder, require_names
 from splashbench.download.unpacking import open_archive
 from splashbench.errors import SplashbenchError
 from splashbench.files import list_files, sha256_file
@@ -444,3 +444,25 @@ def test_killed_twenty_times_the_scenes_have_the_same_bytes(archive: Path, serve
         notes.pop("real_scene.zip.json")
     assert found == expected
     assert list(out.rglob(".tmp-*")) == []
+
+
+def test_commands_that_check_scenes_of_one_folder_at_once_lose_no_note(tmp_path: Path) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    keys = [f"scene_{number}" for number in range(12)]
+    for key in keys:
+        (tmp_path / key).mkdir()
+
+    def check(key: str) -> None:
+        check_downloaded(tmp_path, key, made=True, again=False, tell=lambda text: None)
+
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(check, keys))
+    assert sorted(json.loads((tmp_path / STATE_FILE).read_text())["scenes"]) == sorted(keys)
+
+
+def test_a_damaged_note_says_that_it_may_be_removed(tmp_path: Path) -> None:
+    (tmp_path / "scene").mkdir()
+    (tmp_path / STATE_FILE).write_text("{")
+    with pytest.raises(SplashbenchError, match=r"scenes\.json cannot be read.*remove it"):
+        check_downloaded(tmp_path, "scene", made=True, again=False, tell=lambda text: None)

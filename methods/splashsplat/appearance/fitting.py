@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from splashbench.errors import SplashbenchError
+from splashbench.gaussians.adam import Adam
 from splashbench.native import memory
 from splashbench.render import Frozen, rasterize
 from splashbench.scene.camera import Camera
@@ -307,7 +308,7 @@ def fit_appearance(
     carriers = ActiveCarriers(track, color_cell)
     decoder = appearance.decoder
     parameters = list(decoder.parameters())
-    heads = torch.optim.Adam(parameters, lr=settings.learning_rate_heads, fused=True)
+    heads = Adam([{"params": parameters, "lr": settings.learning_rate_heads}])
     scales = RowAdam(appearance.log_scales, settings.learning_rate_scales)
     features = SharedFeatures(
         appearance.features,

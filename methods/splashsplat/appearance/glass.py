@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from splashbench.gaussians.adam import Adam
 from splashbench.gaussians.dynamic_model import ellipsoids
 
 from ..carriers.subframe import Track
@@ -120,7 +121,7 @@ class GlassFit:
         self.parameters = [table.requires_grad_() for table in glass.tables.values()]
         rates = {"positions": _POSITION_RATE * voxel, **_RATES}
         groups = [{"params": [table], "lr": rates[name], "rate": rates[name]} for name, table in glass.tables.items()]
-        self._adam = torch.optim.Adam(groups, fused=True)
+        self._adam = Adam(groups)
 
     def step(self, gradients: list[Tensor], factor: float) -> None:
         """Descend along the `gradients` of the parameters; `factor` scales the rates."""

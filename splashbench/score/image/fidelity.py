@@ -31,8 +31,7 @@ def psnr(render: Image, truth: Image, mask: Mask, cap_db: float = 100.0) -> floa
 
 def outside_filled(image: Image, truth: Image, mask: Mask, outside: str) -> Image:
     """`image` [H, W, 3] with the pixels outside `mask` black (`outside="black"`) or the ground truth's ("truth")."""
-    fill = np.zeros_like(truth) if outside == "black" else truth
-    return np.where(mask[..., None], image, fill)
+    return np.where(mask[..., None], image, 0.0 if outside == "black" else truth)
 
 
 def ssim(render: Image, truth: Image, mask: Mask, sigma: float = 1.5) -> tuple[float, float]:

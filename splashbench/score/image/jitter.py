@@ -44,8 +44,8 @@ class JitterError:
         if self._previous is not None:
             last_render, last_truth, last_mask = self._previous
             liquid = mask | last_mask
-            self._render.add((luma_render - last_render)[liquid])
-            self._truth.add((luma_truth - last_truth)[liquid])
+            self._render.add(luma_render[liquid] - last_render[liquid])
+            self._truth.add(luma_truth[liquid] - last_truth[liquid])
         self._previous = luma_render, luma_truth, mask
 
     def value(self) -> float | None:

@@ -32,4 +32,6 @@ def spill_rgb(render: Image, nothing: Image, mask: Mask) -> float:
         mask: [H, W], not empty.
     """
     outside = ~mask
-    return float(np.abs(render[outside] - nothing[outside]).sum()) / (3 * int(np.count_nonzero(mask)))
+    difference = render[outside]
+    difference -= nothing[outside]  # in place: 200 MB each at 4K
+    return float(np.abs(difference, out=difference).sum()) / (3 * int(np.count_nonzero(mask)))

@@ -88,6 +88,11 @@ def _score_frame(
         return row
     row["psnr"] = psnr(render, truth, mask, protocol.psnr_cap_db)
     row["spill"] = spill(alpha, mask)
+    if reference is not None:
+        nothing = _unit(_checked(reference.rendering(name, t), camera, t, "rendering of the reference"))
+        row["dpsnr_bg"] = row["psnr"] - psnr(nothing, truth, mask, protocol.psnr_cap_db)
+        row["spill_rgb"] = spill_rgb(render, nothing, mask)
+        del nothing  # 200 MB at 4K, as each of the images below
     masked_render = outside_filled(render, truth, mask, protocol.outside_mask)
     masked_truth = outside_filled(truth, truth, mask, protocol.outside_mask)
     try:
@@ -96,10 +101,6 @@ def _score_frame(
         raise SplashbenchError(f"{scene.image_path(name, t)}: {error}; such a view cannot be scored") from None
     if lpips is not None:
         row["lpips"] = lpips(masked_render, masked_truth)
-    if reference is not None:
-        nothing = _unit(_checked(reference.rendering(name, t), camera, t, "rendering of the reference"))
-        row["dpsnr_bg"] = row["psnr"] - psnr(nothing, truth, mask, protocol.psnr_cap_db)
-        row["spill_rgb"] = spill_rgb(render, nothing, mask)
     return row
 
 
