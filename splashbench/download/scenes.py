@@ -192,9 +192,8 @@ def check_downloaded(out: Path, key: str, *, made: bool, again: bool, tell: Call
     made: whether it was unpacked now; again: check it in any case; tell: is given `key` where it is checked.
     """
     path, place = out / STATE_FILE, out / key
-    state = _noted(path)
     listing = list_files(place)
-    known = state.scenes.get(key)
+    known = _noted(path).scenes.get(key)
     size = (len(listing.names), listing.bytes)
     if known is None or again or made or (known.files, known.bytes) != size:
         tell(key)

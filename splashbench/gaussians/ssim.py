@@ -71,7 +71,7 @@ def _blurred_product(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _band_rows(height: int, width: int) -> int:
     """How many rows are worked on at a time: all of a small image; of one of 4K so many that its scratch is small."""
-    return min(height, max(_LEAST_ROWS, _BAND_PIXELS // max(1, width)))
+    return max(1, min(height, max(_LEAST_ROWS, _BAND_PIXELS // max(1, width))))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -7,9 +7,16 @@ from collections.abc import Iterator
 import pytest
 
 from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench_methods.scaffold_gs import BackgroundSettings
 
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
     with one_torch_thread():
         yield
+
+
+@pytest.fixture
+def short_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The background of `quick` takes 20 steps instead of 400."""
+    monkeypatch.setitem(BackgroundSettings.presets, "quick", BackgroundSettings.presets["quick"] | {"iterations": 20})

@@ -13,7 +13,6 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench_methods import scaffold_gs
-from splashbench_methods.scaffold_gs import BackgroundSettings
 from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method
 from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
@@ -23,13 +22,10 @@ from splashbench_methods.splashsplat.appearance.targets import TrainingTarget, c
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState, Track
 from splashbench_methods.splashsplat.reconstruction import trace_liquid
 
+# Nothing here asks how good the background is, which would take most of the time.
+pytestmark = pytest.mark.usefixtures("short_background")
+
 TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 20}
-
-
-@pytest.fixture(autouse=True)
-def _short_background(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing here asks how good the background is, which would take most of the time."""
-    monkeypatch.setitem(BackgroundSettings.presets, "quick", BackgroundSettings.presets["quick"] | {"iterations": 20})
 
 
 @pytest.fixture(scope="module")

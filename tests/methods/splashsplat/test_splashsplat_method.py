@@ -14,7 +14,6 @@ from splashbench.harness.contract import Run
 from splashbench.render import rasterize_arrays
 from splashbench.scene import Scene
 from splashbench.synth.balls import ball_centers, write_balls_scene
-from splashbench_methods.scaffold_gs import BackgroundSettings
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.appearance.targets import collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import locate
@@ -215,12 +214,10 @@ def test_the_silhouette_term_averages_over_image_window_or_mask(balls: Scene):
         assert part.camera.width * part.camera.height < whole.area
 
 
-def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+# Figures are within the masks, where the background hardly counts; it would take most of the time.
+@pytest.mark.usefixtures("short_background")
+def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(tmp_path: Path):
     """Three of five cameras expose up to half a step early or late; the test views are in time."""
-    # Figures are within the masks, where the background hardly counts and would take most of the time.
-    monkeypatch.setitem(BackgroundSettings.presets, "quick", BackgroundSettings.presets["quick"] | {"iterations": 20})
     n_frames = 6
     step = 0.33 / (n_frames - 1)
     delays = {"1": -0.4 * step, "3": 0.45 * step, "5": -0.3 * step}
