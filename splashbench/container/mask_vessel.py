@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from splashbench.arrays import Floats
-from splashbench.observe.container import depth_image
+from splashbench.container.mask_kernels import least_within, overlap
+from splashbench.observe.container import depth_image, nearest_drawn
 from splashbench.scene import Camera
 from splashbench.scene.container import ContainerMesh
 
@@ -145,20 +146,29 @@ class _MaskView:
         distance = np.where(padded > 0, inner - 0.5, 0.5 - outer).astype(np.float32)[1:-1, 1:-1]
         return cls(small, shrunk, np.ascontiguousarray(distance))
 
-    def within(self, points: Floats) -> Floats:
-        """Pixels by which points [..., 3] lie within the mask; those beyond the image's border as the border."""
-        flat = points.reshape(-1, 3)
-        uv, depth = self.camera.project(flat)
-        at = np.clip(np.nan_to_num(uv - 0.5), 0, [self.camera.width - 1, self.camera.height - 1]).astype(np.float32)
-        values = cv2.remap(
-            self.distance, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )[0]
-        return np.where(depth > 0, values, -np.inf).reshape(points.shape[:-1])
+    @cached_property
+    def projection(self) -> Floats:
+        """Scene to pixels, [3, 4]."""
+        return np.ascontiguousarray(self.camera.projection)
 
     def covered(self, mesh: ContainerMesh) -> float:
         """Intersection over union of the mesh's silhouette and the mask."""
-        drawn = np.isfinite(depth_image(mesh, self.camera))
-        return float((drawn & self.mask).sum() / max((drawn | self.mask).sum(), 1))
+        vertices = np.ascontiguousarray(mesh.vertices, np.float64)
+        near = nearest_drawn(vertices @ self.camera.w2c[2, :3] + self.camera.w2c[2, 3])
+        both, either = overlap(vertices, mesh.faces, self.projection, self.mask, near) if near > 0 else (-1, -1)
+        if either < 0:
+            drawn = np.isfinite(depth_image(mesh, self.camera))
+            both, either = int((drawn & self.mask).sum()), int((drawn | self.mask).sum())
+        return both / max(either, 1)
+
+
+def _within(views: Sequence[_MaskView], points: Floats) -> Floats:
+    """Pixels by which points [..., 3] lie within all masks; those beyond an image's border as the border."""
+    flat = np.ascontiguousarray(points.reshape(-1, 3), np.float64)
+    least = np.full(len(flat), np.inf)
+    for view in views:
+        least_within(view.distance, view.projection, flat, least)
+    return least.reshape(points.shape[:-1])
 
 
 def vessel_from_masks(
@@ -308,7 +318,7 @@ class _Search:
         middle = self.start + shift @ self.frame[:2]
         along = np.linspace(-0.6 * self.reach, 0.6 * self.reach, 301)
         line = middle + along[:, None] * turned[2]
-        inside = np.min([view.within(line) for view in self.views], axis=0) > -_TOLERANCE
+        inside = _within(self.views, line) > -_TOLERANCE
         # The piece about the middle: another may lie where masks meet by chance.
         breaks = np.flatnonzero(~inside)
         nearest = int(np.argmin(np.where(inside, np.abs(along), np.inf)))
@@ -323,7 +333,7 @@ class _Search:
         for _ in range(_BISECTIONS):
             tried = 0.5 * (lowest + highest)
             ring_points = body.rings(tried)
-            fits = np.min([view.within(ring_points).min(axis=1) for view in self.views], axis=0) > -_TOLERANCE
+            fits = _within(self.views, ring_points).min(axis=1) > -_TOLERANCE
             lowest, highest = np.where(fits, tried, lowest), np.where(fits, highest, tried)
         return VesselBody(middle, turned, outline, heights, np.maximum(lowest, 1e-6 * self.reach))
 

@@ -26,7 +26,7 @@ def depth_image(mesh: ContainerMesh, camera: Camera) -> np.ndarray:
     cut off.
     """
     local = mesh.vertices @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
-    near = _NEAR * float(local[:, 2].max())
+    near = nearest_drawn(local[:, 2])
     if near <= 0:
         return np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     clipped = _in_front(local[mesh.faces], near)
@@ -35,6 +35,12 @@ def depth_image(mesh: ContainerMesh, camera: Camera) -> np.ndarray:
     return mesh_kernels.raster(
         np.concatenate([homogeneous[..., :2] * inverse, inverse], axis=-1), camera.height, camera.width
     )
+
+
+def nearest_drawn(depths: np.ndarray) -> float:
+    """The least depth at which `depth_image` draws a mesh whose vertices have these; none is drawn where it is not
+    positive."""
+    return _NEAR * float(depths.max())
 
 
 def _in_front(triangles: np.ndarray, near: float) -> np.ndarray:

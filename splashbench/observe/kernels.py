@@ -75,7 +75,11 @@ def resample(field: np.ndarray, shape: tuple[int, int, int], ratio: float) -> np
     """`field` on another grid of the same origin whose voxel is `ratio` voxels of `field`: float32 `shape`."""
     if ratio == int(ratio):
         # Its nodes are nodes of `field`.
-        i, j, k = (np.minimum(np.arange(n) * int(ratio), last - 1) for n, last in zip(shape, field.shape))
+        step = int(ratio)
+        if all((n - 1) * step < nodes for n, nodes in zip(shape, field.shape)):
+            i, j, k = (slice(0, (n - 1) * step + 1, step) for n in shape)
+            return np.ascontiguousarray(field[i, j, k], np.float32)
+        i, j, k = (np.minimum(np.arange(n) * step, nodes - 1) for n, nodes in zip(shape, field.shape))
         return np.ascontiguousarray(field[i][:, j][:, :, k], np.float32)
     out = np.empty(shape, np.float32)
     over_range(_resample, shape[0], np.ascontiguousarray(field), float(ratio), out)

@@ -13,7 +13,7 @@ from splashbench.observe.kernels import resample
 from splashbench.parallel import over_range
 
 # Pixels: neighbouring triangles must not leave a crack between them by rounding.
-_EDGE_SLACK = 1e-7
+EDGE_SLACK = 1e-7
 # Pixels of a depth image that are worth a thread.
 _FEWEST_PIXELS = 1 << 16
 # Voxels: grid lines are counted beside the nodes, so that they meet no vertex and no edge of a mesh that was built on
@@ -44,7 +44,7 @@ def _raster(corners: np.ndarray, depth: np.ndarray, start: int, stop: int) -> No
                 a = ((x1 - x) * (y2 - y) - (x2 - x) * (y1 - y)) / area
                 b = ((x2 - x) * (y0 - y) - (x0 - x) * (y2 - y)) / area
                 c = 1.0 - a - b
-                if a < -_EDGE_SLACK or b < -_EDGE_SLACK or c < -_EDGE_SLACK:
+                if a < -EDGE_SLACK or b < -EDGE_SLACK or c < -EDGE_SLACK:
                     continue
                 # 1 / z is linear in the image.
                 z = np.float32(1.0 / (a * w0 + b * w1 + c * w2))

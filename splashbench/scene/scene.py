@@ -19,6 +19,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import image_size, read_gray, read_npz, sha256_file
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, mesh_path, read_mesh
+from splashbench.scene.kept_pictures import KeptPictures
 from splashbench.scene.neurofluid import NeuroFluidSource, is_neurofluid
 from splashbench.scene.particles import Particles
 from splashbench.scene.source import ReleasedSource, SceneSource
@@ -261,6 +262,8 @@ class TrainingScene:
             scene.is_released,
         )
         self.container_transparent = scene.container_transparent
+        pixels = sum(camera.width * camera.height for camera in self.cameras.values())
+        self._pictures = KeptPictures(4 * pixels * self.n_frames)
         #: how it differs from the scene in its folder; empty where it does not
         self.variation = ""
 
@@ -274,12 +277,12 @@ class TrainingScene:
     def image(self, camera: str, t: int) -> NDArray[np.uint8]:
         """sRGB uint8 [H, W, 3] of a training camera at timestep `t`."""
         self._training_only(camera)
-        return self._scene.image(camera, t)
+        return self._pictures.get("image", camera, t, self._scene.image)
 
     def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
         """Liquid mask [H, W] of a training camera at timestep `t`."""
         self._training_only(camera)
-        return self._scene.mask(camera, t)
+        return self._pictures.get("mask", camera, t, self._scene.mask)
 
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
         """Container mask [H, W] of a training camera, or None."""

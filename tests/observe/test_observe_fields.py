@@ -184,6 +184,9 @@ def test_trilinear_interpolation_is_exact_for_linear_fields():
     points = np.random.default_rng(0).random((50, 3)) * [4, 5, 6]
     np.testing.assert_allclose(sample(field, points), points @ [2, -3, 0.5] + 1, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(resample(field, (3, 4, 4), 1.5)[1, 2, 3], 3 - 9 + 2.25 + 1, rtol=1e-6)
+    # Every second node, and beyond the last one that one.
+    np.testing.assert_array_equal(resample(field, (3, 3, 4), 2), field[::2, ::2, ::2])
+    np.testing.assert_array_equal(resample(field, (3, 3, 5), 2)[..., 4], field[::2, ::2, 6])
 
 
 def test_grids_of_one_box_share_their_origin():

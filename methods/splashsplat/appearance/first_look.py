@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import torch
 
 from ..carriers.subframe import Track
 from .decoder import Decoder
 from .photographs import ReadAhead
+from .projection import project
 from .targets import HIDDEN, TrainingTarget
 
 # How far behind the nearest carrier of a pixel another one is still seen, transport voxels.
@@ -35,6 +37,8 @@ _PASSING = 6
 LEAST_FEATURES, LEAST_HIDDEN = _CERTAINTY + 1, _PASSING
 # The other units' say at the start, as a share of what they would have.
 _NOISE = 0.1
+# No carrier is hidden.
+_EVERY = np.zeros(0, dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,45 @@ class Look:
 
     colors: np.ndarray
     spread: np.ndarray
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add(
+    positions: np.ndarray,
+    ids: np.ndarray,
+    seen: np.ndarray,
+    projection: np.ndarray,
+    corner: tuple[int, int],
+    mask: np.ndarray,
+    image: np.ndarray,
+    reach: float,
+    nearest: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Adds weight, weighted colours and their weighted squares to sums [count, 7], of carriers within a photograph's
+    mask; nearest: float64 of the mask's shape, inf. No carrier is in a frame twice."""
+    height, width = mask.shape
+    rows, columns = np.full(len(positions), -1, np.int64), np.empty(len(positions), np.int64)
+    depths = np.empty(len(positions))
+    for n in range(len(positions)):
+        if len(seen) > 0 and not seen[n]:
+            continue
+        u, v, depth = project(projection, positions[n, 0], positions[n, 1], positions[n, 2])
+        column, row = np.floor(u) - corner[0], np.floor(v) - corner[1]
+        if depth > 0 and 0 <= column < width and 0 <= row < height and mask[int(row), int(column)]:
+            rows[n], columns[n], depths[n] = int(row), int(column), depth
+            nearest[rows[n], columns[n]] = min(nearest[rows[n], columns[n]], depth)
+    for n in range(len(positions)):
+        row, column = rows[n], columns[n]
+        if row < 0:
+            continue
+        weight = 1.0 if depths[n] <= nearest[row, column] + reach else _BEHIND
+        total = sums[ids[n]]
+        total[0] += weight
+        for channel in range(3):
+            color = image[row, column, channel] / 255
+            total[1 + channel] += weight * color
+            total[4 + channel] += weight * color**2
 
 
 def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
@@ -61,23 +104,19 @@ def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
         if following is not None:
             reader.prepare(following.photograph)
         mask = photograph.mask.numpy()
-        pixels, depth = target.camera.project(track.state(target.frame, target.fraction).positions.numpy())
-        ids = track.ids(target.frame).numpy()
-        cells = np.floor(pixels).astype(np.int64) - (photograph.left, photograph.top)
-        chosen = (depth > 0) & (cells >= 0).all(axis=1) & (cells < mask.shape[::-1]).all(axis=1)
-        if target.hidden is not None:
-            chosen &= target.hidden.numpy() < HIDDEN // 2
-        chosen[chosen] = mask[cells[chosen, 1], cells[chosen, 0]]
-        ids, cells, depth = ids[chosen], cells[chosen], depth[chosen]
-        numbers = cells[:, 1] * mask.shape[1] + cells[:, 0]
-        nearest = np.full(mask.size, np.inf)
-        np.minimum.at(nearest, numbers, depth)
-        weight = np.where(depth <= nearest[numbers] + reach, 1.0, _BEHIND)
-        colors = photograph.image.numpy()[cells[:, 1], cells[:, 0]] / 255
-        # No carrier is in a frame twice.
-        weights[ids] += weight
-        sums_of_colors[ids] += weight[:, None] * colors
-        sums_of_squares[ids] += weight[:, None] * colors**2
+        seen = _EVERY if target.hidden is None else target.hidden.numpy() < HIDDEN // 2
+        _add(
+            track.positions(target.frame, target.fraction),
+            track.carriers.ids[track.carriers.rows(target.frame)],
+            seen,
+            np.ascontiguousarray(target.camera.projection),
+            (photograph.left, photograph.top),
+            np.ascontiguousarray(mask),
+            np.ascontiguousarray(photograph.image.numpy()),
+            reach,
+            np.full(mask.shape, np.inf),
+            sums,
+        )
     reader.close()
     known = weights > 0
     total = np.maximum(weights, 1e-9)[:, None]

@@ -24,6 +24,7 @@ from splashbench.scene.scene import TrainingScene
 from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import WindowPhotograph
 from .photographs import KEPT_BYTES, Deferred, Photograph, Shelf
+from .projection import projected_extent
 
 SilhouetteNorm = Literal["image", "window", "mask"]
 
@@ -80,12 +81,13 @@ def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
 
 def _window(camera: Camera, box: tuple[int, int, int, int], points: np.ndarray) -> tuple[int, int, int, int]:
     """`box` grown so that it holds the projections of `points` too, within the image."""
-    pixels, depth = camera.project(points)
-    pixels = pixels[depth > 0]
-    if len(pixels) == 0:
+    extent = projected_extent(camera, points)
+    if extent is None:
         return box
-    low = np.floor(pixels.min(axis=0)).astype(int) - MASK_MARGIN
-    high = np.ceil(pixels.max(axis=0)).astype(int) + MASK_MARGIN
+    # Far beyond the image is beside it: no number is too large for an integer.
+    extent = np.clip(extent, -1, np.array([camera.width, camera.height] * 2) + 1)
+    low = np.floor(extent[:2]).astype(int) - MASK_MARGIN
+    high = np.ceil(extent[2:]).astype(int) + MASK_MARGIN
     return (
         int(np.clip(low[0], 0, box[0])),
         int(np.clip(low[1], 0, box[1])),
@@ -186,7 +188,7 @@ def collect_targets(
                 continue
             frame, fraction = locate(scene.times, float(taken[t]))
             fraction = fraction if abs(fraction) > SAME_TIME else 0.0
-            positions = track.state(frame, fraction).positions.numpy()
+            positions = track.positions(frame, fraction)
             if len(positions) == 0:
                 continue
             box = _extent(mask, MASK_MARGIN)

@@ -50,6 +50,15 @@ def _lowest(
             near, far = max(near, min(first, second)), min(far, max(first, second))
         best, at = np.inf, near
         way = near
+        # Most rays are covered. To find that, steps may be as long as the way to where a ray would be at the earliest.
+        while way <= far and best > COVERED * scale:
+            x, y = eye[0] + way * directions[n, 0], eye[1] + way * directions[n, 1]
+            value = scale * trilinear(phi, x, y, eye[2] + way * directions[n, 2])
+            best = min(best, value)
+            way += max(_STEP, value - COVERED * scale)
+        # Of the others, the lowest place is wanted.
+        if best > COVERED * scale:
+            best, way = np.inf, near
         while way <= far and best > COVERED * scale:
             x, y = eye[0] + way * directions[n, 0], eye[1] + way * directions[n, 1]
             value = scale * trilinear(phi, x, y, eye[2] + way * directions[n, 2])

@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from splashbench.observe.grid import Grid
-from splashbench.observe.kernels import sample
+from splashbench.observe.kernels import sample, trilinear
+from splashbench.parallel import over_range
 
 # A cell's corner is this far from its middle, in cells: beyond it, no part of the cell can be in the shell.
 _HALF_DIAGONAL = 0.87
 _TRIES_PER_CARRIER = 6
+_SMALL_LOOP = 1024
 # Below this depth, in voxels, few carriers do: the liquid's surface lies there where the hull is much larger than it.
 _INTERIOR = 3.0
 
@@ -108,11 +111,50 @@ def newborns(
     # Each cell draws candidates and keeps the first that fall into the shell: of a cell that lies in it most do.
     cut = (middle < -shell.depth + _HALF_DIAGONAL) | (middle > shell.outside - _HALF_DIAGONAL)
     tries = _TRIES_PER_CARRIER * np.where(cut, shell.max_per_cell, missing)
-    owner = np.repeat(np.arange(len(centres)), tries)
-    candidates = centres[owner] + rng.random((len(owner), 3), dtype=np.float32) - np.float32(0.5)
-    depth = sample(phi, candidates * np.float32(ratio))
-    valid = (depth <= shell.outside) & (depth >= -shell.depth)
-    so_far = np.cumsum(valid)
-    starts = np.cumsum(tries) - tries
-    before = so_far[starts] - valid[starts]
-    return np.ascontiguousarray(candidates[valid & (so_far - before[owner] <= missing[owner])])
+    starts = np.concatenate([[0], np.cumsum(tries)])
+    candidates = rng.random((int(starts[-1]), 3), dtype=np.float32)
+    chosen = np.zeros(len(candidates), dtype=bool)
+    bounds = np.float32(-shell.depth), np.float32(shell.outside)
+    over_range(
+        _keep_first,
+        len(centres),
+        np.ascontiguousarray(phi),
+        np.float32(ratio),
+        centres,
+        missing,
+        starts,
+        bounds,
+        candidates,
+        chosen,
+        smallest=_SMALL_LOOP,
+    )
+    return candidates[chosen]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _keep_first(
+    phi: np.ndarray,
+    ratio: float,
+    centres: np.ndarray,
+    missing: np.ndarray,
+    starts: np.ndarray,
+    bounds: tuple[float, float],
+    candidates: np.ndarray,
+    chosen: np.ndarray,
+    start: int,
+    stop: int,
+) -> None:
+    """Chooses of each cell's candidates the first `missing` whose phi is within `bounds`; candidates: places within the
+    cells, float32 [M, 3] in [0, 1), which become those in the grid as far as they were looked at."""
+    half = np.float32(0.5)
+    for cell in range(start, stop):
+        found = 0
+        for n in range(starts[cell], starts[cell + 1]):
+            for axis in range(3):
+                candidates[n, axis] = centres[cell, axis] + candidates[n, axis] - half
+            depth = trilinear(phi, candidates[n, 0] * ratio, candidates[n, 1] * ratio, candidates[n, 2] * ratio)
+            if bounds[0] <= np.float32(depth) <= bounds[1]:
+                chosen[n] = True
+                found += 1
+                if found == missing[cell]:
+                    break

@@ -81,8 +81,15 @@ class Track:
             other = t + 1 if fraction > 0 else t - 1
             nearer, farther = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
             phi = ((1 - abs(fraction)) * nearer + abs(fraction) * farther).astype(np.float32)
-        scene_positions = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))
-        return CarrierState(scene_positions, torch.from_numpy(deformation), torch.from_numpy(phi))
+        places = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))
+        return CarrierState(places, torch.from_numpy(deformation), torch.from_numpy(phi))
+
+    def positions(self, t: int, fraction: float = 0.0) -> np.ndarray:
+        """The positions of `state` alone, float32 [n, 3]."""
+        positions = self.carriers.positions[self.carriers.rows(t)]
+        if fraction != 0 and len(positions):
+            positions = self.motion.step(t if fraction > 0 else t - 1).moved(positions, fraction)
+        return self.grid.to_scene(positions).astype(np.float32)
 
     def moved(self, t: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """Where frame `t`'s carriers are (transport grid), and their F, a `fraction` of a step after the frame."""

@@ -116,8 +116,7 @@ class CarrierTracker:
         born = len(self._last_frames)
         if self._settings.variant not in ("no_resampling", "flip") or born == 0:
             self._resample(t, phi, born)
-        deformation = self._F if self._tracking.keep_deformation else undeformed(len(self._ids))
-        self._frames.append((self._ids, self._x, deformation, sample(phi, self._x * self._ratio)))
+        self._frames.append((self._ids, self._x, self._F, sample(phi, self._x * self._ratio)))
 
     def carriers(self) -> Carriers:
         """The carriers of all frames so far."""
@@ -131,7 +130,10 @@ class CarrierTracker:
     def _forecast(self, t: int, phi: np.ndarray, step: FrameStep) -> None:
         """Forecast, correct, and drop what left the liquid, outlived its time or crowds a cell."""
         start, settings = self._x, self._settings
-        self._x, self._F = step.forecast(start, self._F)
+        if self._tracking.keep_deformation:
+            self._x, self._F = step.forecast(start, self._F)
+        else:
+            self._x = step.moved(start)
         if self._tracking.landed is not None:
             self._x = self._tracking.landed(t, start, self._x)
         x = self._x = correct(phi, self._x, float(self._ratio), settings.correction)
@@ -152,14 +154,19 @@ class CarrierTracker:
             new = np.concatenate([new, tracking.uncovered(t, phi) / self._ratio])
         self._ids = np.concatenate([self._ids, np.arange(born, born + len(new), dtype=np.int32)])
         self._x = np.concatenate([self._x, new])
-        self._F = np.concatenate([self._F, np.broadcast_to(np.eye(3, dtype=np.float32), (len(new), 3, 3))])
+        self._F = (
+            np.concatenate([self._F, undeformed(len(new))])
+            if self._tracking.keep_deformation
+            else undeformed(len(self._ids))
+        )
         ages = _ages(len(new), settings.lifetime, np.random.default_rng([tracking.seed, t, 1]))
         self._last_frames = np.concatenate([self._last_frames, t + ages])
         if tracking.simulation is not None and settings.variant == "flip" and len(self._last_frames):
             self._simulation = tracking.simulation(phi, self._ids, self._x)
 
     def _keep(self, chosen: np.ndarray | slice) -> None:
-        self._ids, self._x, self._F = self._ids[chosen], self._x[chosen], self._F[chosen]
+        self._ids, self._x = self._ids[chosen], self._x[chosen]
+        self._F = self._F[chosen] if self._tracking.keep_deformation else undeformed(len(self._ids))
 
 
 def _ages(count: int, lifetime: int | None, rng: np.random.Generator) -> np.ndarray:

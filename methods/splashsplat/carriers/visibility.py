@@ -59,13 +59,13 @@ def _seen(
             if a < 0 or b < 0 or c < 0 or a > top_x or b > top_y or c > top_z:
                 break
             value = scale * trilinear(phi, a, b, c)
+            # The surface is no nearer than the distance says.
+            free = max(_STEP, abs(value))
+            way += free - _STEP
             if value < 0:
-                crossed += _STEP
+                crossed += free
                 if crossed > limit:
                     break
-            elif value > _STEP:
-                # Nothing is nearer than the distance says.
-                way += value - _STEP
         seen[n] = crossed <= limit
 
 

@@ -125,18 +125,28 @@ class Observations:
                     phi = next(frames)
                     if self.cues is not None:
                         phi = self.cues.refined(phi, self.hull_grid, t)
-                    phi = torch.from_numpy(phi).half().numpy()  # twice as fast as numpy's, and the same
+                    phi = _converted(phi, np.float16)
             yield phi
 
     def in_transport_voxels(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`phi` of `signed_distances` as float32 in transport voxels, on the hull grid and on the transport grid."""
-        phi = phi.astype(np.float32)
+        phi = _converted(phi, np.float32)
         phi /= np.float32(self.ratio)
         return phi, resample(phi, self.grid.shape, self.ratio)
 
     def landed(self, t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Where carriers that fly from `start` to `end` [N, 3] (transport grid) come to rest in frame `t`."""
         return end if self.cues is None else self.cues.landed(self.grid, t, start, end)
+
+
+def _converted(phi: np.ndarray, kind: type[np.floating[Any]]) -> np.ndarray:
+    """`phi` as `kind`: by PyTorch, which is faster than NumPy, into memory from NumPy, which asks for huge pages."""
+    converted = np.empty(phi.shape, kind)
+    if phi.flags.writeable:
+        torch.from_numpy(converted).copy_(torch.from_numpy(phi))
+    else:
+        converted[:] = phi  # from a file that runs share, of which PyTorch would warn
+    return converted
 
 
 def pack_signed_distance(phi: np.ndarray) -> np.ndarray:

@@ -155,19 +155,11 @@ class _Room:
 
     @classmethod
     def of(cls, vessel: Vessel, grid: Grid) -> _Room:
-        chosen, heights, distances = [], [], []
-        ny, nz = grid.shape[1:]
-        plane = np.stack(np.meshgrid(np.arange(ny), np.arange(nz), indexing="ij"), axis=-1).reshape(-1, 2)
-        for i in range(grid.shape[0]):  # a plane at a time: the whole grid's coordinates are too much to hold
-            points = grid.to_scene(np.column_stack([np.full(len(plane), i), plane]))
-            distance = vessel.room(points) / np.float32(grid.voxel)
-            near = np.nonzero(distance < _NEAR)[0]
-            chosen.append(i * ny * nz + near)
-            heights.append(vessel.height(points[near]))
-            distances.append(distance[near])
-        height = np.concatenate(heights)
+        distance = vessel.room(grid).reshape(-1)
+        near = np.flatnonzero(distance < _NEAR)
+        height = vessel.height(grid.to_scene(np.stack(np.unravel_index(near, grid.shape), axis=1)))
         order = np.argsort(height, kind="stable")
-        return cls(grid, np.concatenate(chosen)[order], height[order], np.concatenate(distances)[order])
+        return cls(grid, near[order], height[order], distance[near][order])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

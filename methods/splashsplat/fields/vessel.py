@@ -18,6 +18,10 @@ from splashbench.scene.container import ContainerMesh
 VESSEL_CELLS = 96
 # Nodes of a slice that walls must enclose for it to hold anything.
 _SMALLEST_ROOM = 4
+# Share of the corners of a node's cell, weighted by nearness, that walls must enclose.
+_ENCLOSED = 0.25
+# What stands for the distance, in the vessel's voxels, where it can hold nothing.
+_ELSEWHERE = 20.0
 
 
 def upright(gravity: np.ndarray) -> np.ndarray:
@@ -67,18 +71,47 @@ class Vessel:
         """Height of `points` [..., 3] (scene units), scene units above the scene's origin."""
         return np.asarray(points) @ self.turn[2]
 
-    def room(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance of `points` [N, 3] (scene units) to the wall from within: float32 [N], scene units, negative
+    def room(self, grid: Grid) -> np.ndarray:
+        """Signed distance of the nodes of `grid` to the wall from within: float32 of its shape, its voxels, negative
         where the vessel can hold liquid, large elsewhere."""
-        nodes = self.grid.to_voxels(points @ self.turn.T)
-        beyond = np.abs(nodes - np.clip(nodes, 0, np.array(self.grid.shape) - 1)).max(axis=1) > 0
-        distance = -sample(self.solid, nodes)
-        enclosed = (sample(self.inside, nodes) > 0.25) | (distance > 0)
-        return np.where(enclosed & ~beyond, distance, 20).astype(np.float32) * np.float32(self.grid.voxel)
+        room = np.empty(grid.shape, dtype=np.float32)
+        # Of the nodes' numbers, coordinates in the vessel's grid.
+        origin = (self.turn @ grid.origin - self.grid.origin) / self.grid.voxel
+        turn = self.turn * (grid.voxel / self.grid.voxel)
+        scale = self.grid.voxel / grid.voxel
+        over_range(_room, grid.shape[0], self.solid, self.inside, origin, np.ascontiguousarray(turn), scale, room)
+        return room
 
     def walled(self, points: np.ndarray) -> np.ndarray:
         """bool [N]: whether `points` [N, 3] (scene units) lie in the container's walls."""
         return sample(self.solid, self.grid.to_voxels(points @ self.turn.T)) < 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _room(
+    solid: np.ndarray,
+    inside: np.ndarray,
+    origin: np.ndarray,
+    turn: np.ndarray,
+    scale: float,
+    room: np.ndarray,
+    start: int,
+    stop: int,
+) -> None:
+    top_x, top_y, top_z = solid.shape[0] - 1.0, solid.shape[1] - 1.0, solid.shape[2] - 1.0
+    elsewhere = np.float32(_ELSEWHERE * scale)
+    for i in range(start, stop):
+        for j in range(room.shape[1]):
+            for k in range(room.shape[2]):
+                x = origin[0] + turn[0, 0] * i + turn[0, 1] * j + turn[0, 2] * k
+                y = origin[1] + turn[1, 0] * i + turn[1, 1] * j + turn[1, 2] * k
+                z = origin[2] + turn[2, 0] * i + turn[2, 1] * j + turn[2, 2] * k
+                room[i, j, k] = elsewhere
+                if x < 0 or y < 0 or z < 0 or x > top_x or y > top_y or z > top_z:
+                    continue
+                distance = -trilinear(solid, x, y, z)
+                if distance > 0 or trilinear(inside, x, y, z) > _ENCLOSED:
+                    room[i, j, k] = distance * scale
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

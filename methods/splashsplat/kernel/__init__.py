@@ -1,1 +1,1 @@
-"""SplashSplat's own compiled kernel: decoder, losses of an image window, and Adam by rows."""
+"""SplashSplat's own compiled kernel: decoder, losses of an image window, Adam by rows, and the fit of velocities."""

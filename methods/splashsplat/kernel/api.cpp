@@ -6,6 +6,7 @@
 
 #include "adam.h"
 #include "decode.h"
+#include "descend.h"
 #include "native/threads.h"
 #include "window_loss.h"
 
@@ -75,6 +76,10 @@ int splash_window_gradients(const SplashWindow* window, const float* image, cons
     } catch (...) {  // nothing but std::bad_alloc is thrown
         return SPLASH_OUT_OF_MEMORY;
     }
+}
+
+void splash_descend(const SplashDescent* descent, float* update, float* residual, int32_t threads) {
+    splash::descend(*descent, update, residual, splash::workers(threads));
 }
 
 const char* splash_kernel(void) { return "splashsplat"; }

@@ -11,7 +11,7 @@ extern "C" {
 #endif
 
 // Raised with every change to what follows; the loader refuses another version.
-#define SPLASH_ABI_VERSION 1
+#define SPLASH_ABI_VERSION 2
 
 // Heads that turn n carriers' features into K children each (decode.py): weights [outputs, inputs], biases [outputs].
 typedef struct SplashHeads {
@@ -96,6 +96,22 @@ SPLASH_API int splash_window_losses(const SplashWindow*, const float* image, con
 // Gradients of the losses' weighted sum.
 SPLASH_API int splash_window_gradients(const SplashWindow*, const float* image, const float* opacity, const double weights[3],
                                        float* grad_image, float* grad_opacity, int32_t threads);
+
+// What a velocity is fitted to. shape: of the signed distances' grid; before: [., ., ., 4], phi_t and its gradient; after:
+// [., ., .], phi_{t+1}. control: [., ., ., 4], the velocity on a grid of control_shape, voxels a frame, and nothing;
+// factor: voxels per control cell. nodes: [., 3], by control cell: those of cell c are starts[c] to starts[c + 1].
+// step: share of the displacement that is taken.
+typedef struct SplashDescent {
+    int32_t shape[3], control_shape[3];
+    float factor[3], step;
+    const float *before, *after, *control;
+    int64_t cells;
+    const int64_t* starts;
+    const int32_t* nodes;
+} SplashDescent;
+
+// Sums over each control cell's nodes: of displacements [cells, 3] and of absolute residuals [cells].
+SPLASH_API void splash_descend(const SplashDescent*, float* update, float* residual, int32_t threads);
 
 #ifdef __cplusplus
 }

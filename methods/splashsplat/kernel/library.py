@@ -91,6 +91,23 @@ class WindowStruct(Structure):
     )
 
 
+class DescentStruct(Structure):
+    """SplashDescent."""
+
+    _fields_ = (
+        ("shape", c_int32 * 3),
+        ("control_shape", c_int32 * 3),
+        ("factor", c_float * 3),
+        ("step", c_float),
+        ("before", c_void_p),
+        ("after", c_void_p),
+        ("control", c_void_p),
+        ("cells", c_int64),
+        ("starts", c_void_p),
+        ("nodes", c_void_p),
+    )
+
+
 _FUNCTIONS: dict[str, Signature] = {
     "splash_decode_kept": (c_int64, (POINTER(HeadsStruct), c_int64)),
     "splash_decode": (
@@ -119,6 +136,7 @@ _FUNCTIONS: dict[str, Signature] = {
         ),
     ),
     "splash_adam_rows": (None, (POINTER(RowAdamStruct), c_int64, c_void_p, c_void_p, c_float, c_int32)),
+    "splash_descend": (None, (POINTER(DescentStruct), c_void_p, c_void_p, c_int32)),
     "splash_window_losses": (c_int32, (POINTER(WindowStruct), c_void_p, c_void_p, c_double * 3, c_int32)),
     "splash_window_gradients": (
         c_int32,
@@ -126,4 +144,4 @@ _FUNCTIONS: dict[str, Signature] = {
     ),
 }
 
-KERNEL = CompiledKernel("splashsplat", Path(__file__).parent, abi_version=1, functions=_FUNCTIONS)
+KERNEL = CompiledKernel("splashsplat", Path(__file__).parent, abi_version=2, functions=_FUNCTIONS)

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from splashbench.observe.kernels import sample
 
-from .advection import forecast
+from .advection import moved
 from .velocity import Factor, cell_numbers
 
 # A fit that takes the liquid's nodes so much farther outside, on average, is not believed (voxels). Of a slow surface
@@ -32,9 +32,8 @@ def gated(control: np.ndarray, factor: Factor, before: np.ndarray, after: np.nda
     # Forwards from what is liquid now, which shows where it leaves, and backwards from what will be, where it arrives.
     for start, end, direction in ((before, after, 1), (after, before, -1)):
         nodes = np.argwhere((start <= 0) & (start >= -_SHELL)).astype(np.float32)
-        identity = np.broadcast_to(np.eye(3, dtype=np.float32), (len(nodes), 3, 3))
-        moved, _ = forecast(direction * control, factor, nodes, identity)
-        gain = np.maximum(sample(end, nodes), 0) - np.maximum(sample(end, moved), 0)
+        ends = moved(direction * control, factor, nodes)
+        gain = np.maximum(sample(end, nodes), 0) - np.maximum(sample(end, ends), 0)
         cell = cell_numbers(nodes, factor, coarse)
         gains += np.bincount(cell, gain, minlength=size)
         counts += np.bincount(cell, minlength=size)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .advection import forecast
+from .advection import forecast, moved
 from .fall import JetFall
 from .velocity import Factor, velocities_at
 
@@ -41,13 +41,25 @@ class FrameStep:
 
         A carrier falls if half way it is still in the jet: one that would land before is carried by what moves there.
         """
-        moved, deformed = forecast(self.control, self.factor, positions, deformation, duration)
+        ends, deformed = forecast(self.control, self.factor, positions, deformation, duration)
         if self.fall is not None:
-            falls = np.flatnonzero(self.fall.holds(positions))
-            falls = falls[self.fall.holds(self.fall.moved(positions[falls], 0.5 * duration))]
-            moved[falls] = self.fall.moved(positions[falls], duration)
+            falls = self._falling(self.fall, positions, duration)
+            ends[falls] = self.fall.moved(positions[falls], duration)
             deformed[falls] = self.fall.deformed(positions[falls], deformation[falls], duration)
-        return moved, deformed
+        return ends, deformed
+
+    def moved(self, positions: np.ndarray, duration: float = 1.0) -> np.ndarray:
+        """The places that `forecast` gives, without F."""
+        ends = moved(self.control, self.factor, positions, duration)
+        if self.fall is not None:
+            falls = self._falling(self.fall, positions, duration)
+            ends[falls] = self.fall.moved(positions[falls], duration)
+        return ends
+
+    def _falling(self, fall: JetFall, positions: np.ndarray, duration: float) -> np.ndarray:
+        """Numbers of the carriers that fall for `duration` frames, int64."""
+        falls = np.flatnonzero(fall.holds(positions))
+        return falls[fall.holds(fall.moved(positions[falls], 0.5 * duration))]
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from scipy.ndimage import gaussian_filter
 
 from splashbench.parallel import over_range
 
+from ..kernel.descend import Descent
+
 _SMALL_LOOP = 1024
 
 #: Transport voxels per control cell: one number, or one along each axis where the cells are no cubes.
@@ -128,61 +130,91 @@ def velocities_at(control: np.ndarray, factor: Factor, positions: np.ndarray) ->
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _descend(
+def _with_gradient(phi: np.ndarray, beside: np.ndarray, start: int, stop: int) -> None:
+    last = (phi.shape[0] - 1, phi.shape[1] - 1, phi.shape[2] - 1)
+    for i in range(start, stop):
+        left, right = max(i - 1, 0), min(i + 1, last[0])
+        for j in range(phi.shape[1]):
+            front, back = max(j - 1, 0), min(j + 1, last[1])
+            for k in range(phi.shape[2]):
+                under, above = max(k - 1, 0), min(k + 1, last[2])
+                beside[i, j, k, 0] = phi[i, j, k]
+                beside[i, j, k, 1] = (phi[right, j, k] - phi[left, j, k]) / np.float32(right - left)
+                beside[i, j, k, 2] = (phi[i, back, k] - phi[i, front, k]) / np.float32(back - front)
+                beside[i, j, k, 3] = (phi[i, j, above] - phi[i, j, under]) / np.float32(above - under)
+
+
+def with_gradient(phi: np.ndarray) -> np.ndarray:
+    """`phi` and its central differences side by side, one-sided at the faces of the grid: float32 [nx, ny, nz, 4]."""
+    beside = np.empty((*phi.shape, 4), np.float32)
+    over_range(_with_gradient, phi.shape[0], np.ascontiguousarray(phi, np.float32), beside)
+    return beside
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _count_band(
     before: np.ndarray,
     after: np.ndarray,
-    control: np.ndarray,
-    factor: tuple[float, float, float],
-    nodes: np.ndarray,
-    starts: np.ndarray,
-    step: float,
-    update: np.ndarray,
-    residual: np.ndarray,
-    start: int,
-    stop: int,
+    band: float,
+    cells: tuple[np.ndarray, np.ndarray, np.ndarray],
+    counts: np.ndarray,
 ) -> None:
-    """Sums the band nodes' displacements into update [C, 3] and absolute residuals into residual [C], per control cell.
+    for i in range(before.shape[0]):
+        for j in range(before.shape[1]):
+            row = counts[cells[0][i], cells[1][j]]
+            for k in range(before.shape[2]):
+                if abs(before[i, j, k]) < band or abs(after[i, j, k]) < band:
+                    row[cells[2][k]] += 1
 
-    before: [nx, ny, nz, 4], phi_t and its gradient side by side. nodes: int32 [M, 3], sorted by control cell; the
-    nodes of cell c are starts[c]:starts[c + 1].
-    """
-    for cell in range(start, stop):
-        for n in range(starts[cell], starts[cell + 1]):
-            x, y, z = nodes[n, 0], nodes[n, 1], nodes[n, 2]
-            u, v, w = velocity_at(control, factor, x, y, z)
-            i, j, k, a, b, c = _locate(before.shape, x - u, y - v, z - w)
-            phi, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-            for di in range(2):
-                wi = a if di else 1 - a
-                for dj in range(2):
-                    wj = wi * (b if dj else 1 - b)
-                    for dk in range(2):
-                        weight = wj * (c if dk else 1 - c)
-                        phi += weight * before[i + di, j + dj, k + dk, 0]
-                        gx += weight * before[i + di, j + dj, k + dk, 1]
-                        gy += weight * before[i + di, j + dj, k + dk, 2]
-                        gz += weight * before[i + di, j + dj, k + dk, 3]
-            error = after[x, y, z] - phi
-            # phi[t](q - u) grows along -u: a positive error asks for a displacement against the gradient. The 0.05
-            # keeps ridges, where the central difference vanishes, from throwing the field about.
-            scale = -step * error / (gx * gx + gy * gy + gz * gz + 0.05)
-            update[cell, 0] += scale * gx
-            update[cell, 1] += scale * gy
-            update[cell, 2] += scale * gz
-            residual[cell] += abs(error)
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _collect_band(
+    before: np.ndarray,
+    after: np.ndarray,
+    band: float,
+    cells: tuple[np.ndarray, np.ndarray, np.ndarray],
+    places: np.ndarray,
+    nodes: np.ndarray,
+) -> None:
+    for i in range(before.shape[0]):
+        for j in range(before.shape[1]):
+            row = places[cells[0][i], cells[1][j]]
+            for k in range(before.shape[2]):
+                if abs(before[i, j, k]) < band or abs(after[i, j, k]) < band:
+                    place = row[cells[2][k]]
+                    nodes[place, 0], nodes[place, 1], nodes[place, 2] = i, j, k
+                    row[cells[2][k]] = place + 1
+
+
+def band_nodes(
+    before: np.ndarray, after: np.ndarray, band: float, factor: Factor, coarse: tuple[int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes within `band` voxels of the surface before or after, int32 [M, 3] by control cell of a grid of shape
+    `coarse`, and int64 [C + 1]: of cell c they are from the c-th of these to the next."""
+    cells = tuple(
+        np.minimum(np.floor((np.arange(n) + 0.5) / width).astype(np.int64), top - 1)
+        for n, width, top in zip(before.shape, factors(factor), coarse)
+    )
+    counts = np.zeros(coarse, np.int64)
+    _count_band(before, after, band, cells, counts)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    nodes = np.empty((int(starts[-1]), 3), np.int32)
+    _collect_band(before, after, band, cells, starts[:-1].reshape(coarse).copy(), nodes)
+    return nodes, starts
 
 
 class DivergenceFree:
     """Projection of fields [nx, ny, nz, 3] onto divergence-free ones, by Fourier transform with zero padding.
 
     The symbol is that of the central difference, so it is this discrete divergence that vanishes; spacing: of the
-    nodes along each axis. Padding to twice the size keeps opposite faces from seeing each other. The padding is a
-    multiple of the field; axis by axis, most of it need not be transformed.
+    nodes along each axis. Padding by half the size keeps opposite faces from seeing each other: twice the size takes
+    twice as long, and changes velocities by less than a step of their fit does. Axis by axis, most of the padding need
+    not be transformed.
     """
 
     def __init__(self, shape: tuple[int, int, int], spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         self.shape = shape
-        self.padded = tuple(fft.next_fast_len(2 * n, real=True) for n in shape)
+        self.padded = tuple(fft.next_fast_len(n + -(-n // 2), real=True) for n in shape)
         px, py, pz = self.padded
         waves = (np.fft.fftfreq(px)[:, None, None], np.fft.fftfreq(py)[:, None], np.fft.rfftfreq(pz))
         relative = [width / min(spacing) for width in spacing]
@@ -235,35 +267,25 @@ def fit_velocity(
     settings = settings or VelocitySettings()
     coarse = control_shape(before.shape, factor)
     control: np.ndarray = np.zeros((*coarse, 3), dtype=np.float32)
-    band = (np.abs(before) < settings.band) | (np.abs(after) < settings.band)
-    if not band.any() or not (before < 0).any() or not (after < 0).any():
+    before, after = (np.ascontiguousarray(phi, np.float32) for phi in (before, after))
+    if not (before < 0).any() or not (after < 0).any():
+        return VelocityFit(control, 0.0, 0.0)
+    nodes, starts = band_nodes(before, after, settings.band, factor, coarse)
+    if len(nodes) == 0:
         return VelocityFit(control, 0.0, 0.0)
     if start is not None:
         control += start
-    nodes = np.argwhere(band).astype(np.int32)
-    cell = cell_numbers(nodes, factor, coarse)
-    order = np.argsort(cell, kind="stable")
-    nodes = np.ascontiguousarray(nodes[order])
-    cells = int(np.prod(coarse))
-    starts = np.searchsorted(cell[order], np.arange(cells + 1))
     counts = np.diff(starts).reshape(*coarse, 1).astype(np.float32)
     voxels = factors(factor)
     in_voxels = settings.smoothing_unit == "transport"
     sigma = tuple(settings.smoothing / (width if in_voxels else 1.0) for width in voxels)
     weight = _smoothed(counts, sigma) + np.float32(1e-3)
     divergence_free = DivergenceFree(coarse, voxels)
-
-    with_gradient = np.stack([before, *np.gradient(before)], axis=-1).astype(np.float32)
-
-    def descend() -> tuple[np.ndarray, float]:
-        update, residual = np.zeros((cells, 3), np.float32), np.zeros(cells, np.float32)
-        fixed = (with_gradient, after, control, voxels, nodes, starts, settings.step_size)
-        over_range(_descend, cells, *fixed, update, residual)
-        return update.reshape(*coarse, 3), float(residual.sum(dtype=np.float64) / len(nodes))
+    descent = Descent(with_gradient(before), after, nodes, starts, coarse, voxels)
 
     first = None
     for _ in range(settings.steps):
-        update, residual = descend()
+        update, residual = descent.step(control, settings.step_size)
         first = residual if first is None else first
         if settings.smooth == "update":
             # Normalised by the equally smoothed count: cells without band nodes take their neighbours' motion.
@@ -275,7 +297,7 @@ def fit_velocity(
         speed = np.sqrt((control**2).sum(axis=-1, keepdims=True))
         slowed = control * np.minimum(1, settings.limit / np.maximum(speed, 1e-6))
         control = np.ascontiguousarray(slowed, dtype=np.float32)
-    return VelocityFit(control, first or 0.0, descend()[1])
+    return VelocityFit(control, first or 0.0, descent.step(control, settings.step_size)[1])
 
 
 def _smoothed(field: np.ndarray, sigma: tuple[float, ...]) -> np.ndarray:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
+from splashbench.parallel import over_range
 from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 from ..carriers.population import Carriers, taken
@@ -26,6 +28,7 @@ POSITION_STEPS = 32
 VELOCITY_STEPS, MAX_VELOCITY = 64, 32767
 #: Carriers of all frames together: a few kilobytes of zeros could ask for more than there is memory.
 MAX_ROWS = 1 << 26
+_SMALL_LOOP = 1024
 
 
 @dataclass(frozen=True)
@@ -187,17 +190,31 @@ def _cell_numbers(cells: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
 
 def _predicted(steps: np.ndarray, control: NDArray[np.int16], motion: Motion) -> np.ndarray:
     """Where the motion leads from `steps` [n, 3] in one frame, int64 [n, 3]: by the velocity there."""
-    nodes = np.array(control.shape[:3])
+    moved = np.empty(steps.shape, np.int64)
     wide = np.array(factors(motion.factor), dtype=np.float64)
-    place = (steps / POSITION_STEPS - 0.5 * (wide - 1)) / wide
-    place = np.clip(place, 0, nodes - 1)
-    low = np.minimum(np.floor(place).astype(np.int64), nodes - 2)
-    share = place - low
-    sides = (1 - share, share)
-    moved = np.zeros(steps.shape)
-    for a in (0, 1):
-        for b in (0, 1):
-            for c in (0, 1):
-                weight = sides[a][:, 0] * sides[b][:, 1] * sides[c][:, 2]
-                moved = moved + weight[:, None] * control[low[:, 0] + a, low[:, 1] + b, low[:, 2] + c]
-    return steps + np.rint(moved * (POSITION_STEPS / VELOCITY_STEPS)).astype(np.int64)
+    over_range(_predict, len(steps), steps, np.ascontiguousarray(control), wide, moved, smallest=_SMALL_LOOP)
+    return moved
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _predict(
+    steps: np.ndarray, control: np.ndarray, wide: np.ndarray, moved: np.ndarray, start: int, stop: int
+) -> None:
+    # What is stored depends on the rounding of every line: the file format has them as they stand here.
+    low, share = np.empty(3, np.int64), np.empty(3)
+    for n in range(start, stop):
+        for axis in range(3):
+            place = (steps[n, axis] / POSITION_STEPS - 0.5 * (wide[axis] - 1)) / wide[axis]
+            place = min(max(place, 0.0), control.shape[axis] - 1.0)
+            low[axis] = min(int(np.floor(place)), control.shape[axis] - 2)
+            share[axis] = place - low[axis]
+        for axis in range(3):
+            total = 0.0
+            for a in range(2):
+                x = share[0] if a else 1 - share[0]
+                for b in range(2):
+                    y = share[1] if b else 1 - share[1]
+                    for c in range(2):
+                        weight = x * y * (share[2] if c else 1 - share[2])
+                        total = total + weight * control[low[0] + a, low[1] + b, low[2] + c, axis]
+            moved[n, axis] = steps[n, axis] + int(np.rint(total * (POSITION_STEPS / VELOCITY_STEPS)))

@@ -44,13 +44,14 @@ GRID = Grid(np.zeros(3), 1.0, (SIZE,) * 3)
 SHELL = ShellSettings(depth=1.5, min_per_cell=2, max_per_cell=2)
 
 
-def track(fields, velocities=None, **settings) -> Carriers:
+def track(fields, velocities=None, keep_deformation: bool = True, **settings) -> Carriers:
     """Run the loop with hull grid = transport grid."""
     pairs = len(fields) - 1
     if velocities is None:
         velocities = np.zeros((pairs, *control_shape((SIZE,) * 3, FACTOR), 3), dtype=np.float32)
     motion = Motion(velocities, FACTOR, [None] * pairs)
-    tracker = CarrierTracker(Tracking(GRID, GRID, CarrierSettings(shell=SHELL, **settings), seed=3))
+    kept = {"keep_deformation": keep_deformation}
+    tracker = CarrierTracker(Tracking(GRID, GRID, CarrierSettings(shell=SHELL, **settings), seed=3, **kept))
     for t, phi in enumerate(fields):
         tracker.advance(phi, None if t == 0 else motion.step(t - 1))
     return tracker.carriers()
@@ -224,6 +225,16 @@ def test_keeping_some_carriers_renumbers_them():
 def test_the_same_seed_gives_the_same_carriers():
     fields = [ball((18, 20, 20)), ball((20, 20, 20))]
     np.testing.assert_array_equal(track(fields).positions, track(fields).positions)
+
+
+def test_carriers_are_the_same_where_nobody_asks_how_they_are_deformed():
+    fields = [ball((18, 20, 20)), ball((19, 20, 20)), ball((21, 20, 20))]
+    velocities = np.stack([control_of(lambda x: 0.2 * (x - 20) * [1, -1, 0]) for _ in range(2)])
+    full, bare = (track(fields, velocities, keep, lifetime=2) for keep in (True, False))
+    for name in ("starts", "ids", "positions", "phi"):
+        np.testing.assert_array_equal(getattr(bare, name), getattr(full, name))
+    assert np.abs(full.deformation - np.eye(3)).max() > 0.1
+    assert (bare.deformation == np.eye(3)).all()
 
 
 # Coverage

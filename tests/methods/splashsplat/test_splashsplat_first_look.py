@@ -1,5 +1,6 @@
 """What a fit begins with: carriers in the colours of the photographs, and a draft where states of the fit are taken."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.appearance.first_look import Look, photographed, take_on
 from splashbench_methods.splashsplat.appearance.fitting import Appearance
+from splashbench_methods.splashsplat.appearance.photographs import read_now
+from splashbench_methods.splashsplat.appearance.projection import projected_extent
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget, collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState, Track
 from splashbench_methods.splashsplat.reconstruction import trace_liquid
@@ -60,6 +63,47 @@ def test_carriers_have_the_colour_of_the_photographs_that_see_them(
             errors.append(np.abs(colors[track.ids(t).numpy()[front]] - truth).mean(axis=1))
             spread.append(np.abs(truth - colors.mean(axis=0)).mean(axis=1))
     assert np.median(np.concatenate(errors)) < 0.4 * np.median(np.concatenate(spread))
+
+
+def test_a_look_is_the_weighted_mean_over_photographs(taught: tuple[Track, list[TrainingTarget]]) -> None:
+    """One photograph, part of whose carriers are hidden, against the definition in plain NumPy."""
+    track, targets = taught
+    target = max(targets, key=lambda target: track.carriers.rows(target.frame).stop)
+    positions = track.state(target.frame).positions.numpy()
+    hidden = torch.from_numpy((np.arange(len(positions)) % 3 == 0).astype(np.uint8) * 255)
+    photograph = read_now(target.photograph)
+    mask = photograph.mask.numpy()
+    pixels, depth = target.camera.project(positions)
+    cells = np.floor(pixels).astype(int) - (photograph.left, photograph.top)
+    seen = (cells >= 0).all(axis=1) & (cells < mask.shape[::-1]).all(axis=1) & (np.arange(len(depth)) % 3 != 0)
+    seen[seen] = mask[cells[seen, 1], cells[seen, 0]]
+    nearest = np.full(mask.shape, np.inf)
+    np.minimum.at(nearest, (cells[seen, 1], cells[seen, 0]), depth[seen])
+    colors = photograph.image.numpy()[cells[seen, 1], cells[seen, 0]] / 255
+    front = depth[seen] <= nearest[cells[seen, 1], cells[seen, 0]] + track.grid.voxel
+    assert 0 < front.mean() < 1
+    look = photographed(track, [replace(target, hidden=hidden)])
+    ids = track.ids(target.frame).numpy()
+    np.testing.assert_allclose(look.colors[ids[seen]], colors, atol=1e-6)
+    weights = np.where(front, 1.0, 0.01)
+    unseen = np.setdiff1d(np.arange(track.carriers.count), ids[seen])
+    mean = (weights[:, None] * colors).sum(axis=0) / weights.sum()
+    np.testing.assert_allclose(look.colors[unseen], np.broadcast_to(mean, (len(unseen), 3)), atol=1e-6)
+
+
+def test_where_carriers_lie_in_a_photograph_is_what_the_camera_says(taught: tuple[Track, list[TrainingTarget]]) -> None:
+    track, targets = taught
+    camera = targets[0].camera
+    for fraction in (0.0, 0.3, -0.4):
+        positions = track.positions(1, fraction)
+        np.testing.assert_array_equal(positions, track.state(1, fraction).positions.numpy())
+        behind = np.concatenate([positions, 2 * camera.center[None].astype(np.float32) - positions])
+        pixels, depth = camera.project(behind)
+        shown = pixels[depth > 0]
+        expected = [*shown.min(axis=0), *shown.max(axis=0)]
+        np.testing.assert_allclose(projected_extent(camera, behind), expected, rtol=1e-9)
+    assert projected_extent(camera, behind[depth <= 0]) is None
+    assert projected_extent(camera, positions[:0]) is None
 
 
 def test_without_a_photograph_carriers_are_grey(taught: tuple[Track, list[TrainingTarget]]) -> None:

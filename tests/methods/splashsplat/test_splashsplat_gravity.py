@@ -206,6 +206,10 @@ def test_carriers_in_the_jet_fly_on_their_parabola_and_stretch():
     np.testing.assert_allclose(half, moved, atol=1e-3)
     back = FrameStep(SIDEWAYS, 4, FALL).forecast(moved, eyes(1), -1.0)[0]
     np.testing.assert_allclose(back, start, atol=1e-3)
+    # Nor do places depend on whether F is asked for.
+    both = np.concatenate([start, low, in_the_jet(np.array([0.2]), aside=0.05)])
+    step = FrameStep(SIDEWAYS, 4, FALL)
+    np.testing.assert_array_equal(step.moved(both, 0.7), step.forecast(both, eyes(3), 0.7)[0])
 
 
 def test_motion_is_read_as_it_was_written():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splashbench_methods.splashsplat.carriers.correction import correct
-from splashbench_methods.splashsplat.motion.advection import clamp_stretch, forecast
+from splashbench_methods.splashsplat.motion.advection import clamp_stretch, forecast, moved
 from splashbench_methods.splashsplat.motion.velocity import (
     DivergenceFree,
     VelocityFit,
@@ -213,6 +213,25 @@ def test_stretch_is_clamped_wherever_a_singular_value_leaves_the_bounds():
     expected = (left * np.clip(stretch, 1 / 3, 3)[:, None]) @ right
     np.testing.assert_allclose(clamp_stretch(deformation), expected, atol=2e-5)
     assert clamp_stretch(deformation[:0]).shape == (0, 3, 3)
+
+
+def test_what_has_no_volume_left_gets_some():
+    rng = np.random.default_rng(1)
+    flat = rng.normal(size=(50, 3, 2)) @ rng.normal(size=(50, 2, 3))
+    line = rng.normal(size=(50, 3, 1)) @ rng.normal(size=(50, 1, 3))
+    deformation = np.concatenate([flat, line, np.zeros((1, 3, 3))]).astype(np.float32)
+    stretch = np.linalg.svd(clamp_stretch(deformation), compute_uv=False)
+    assert stretch.min() > 1 / 3 - 1e-5
+    assert stretch.max() < 3 + 1e-5
+
+
+def test_places_do_not_depend_on_whether_the_deformation_is_asked_for():
+    rng = np.random.default_rng(2)
+    control = rng.normal(0, 2, (*control_shape((SIZE,) * 3, FACTOR), 3)).astype(np.float32)
+    x = rng.uniform(-2, SIZE + 2, (3000, 3)).astype(np.float32)
+    F = np.broadcast_to(np.eye(3, dtype=np.float32), (len(x), 3, 3))
+    for duration in (1.0, -0.4):
+        np.testing.assert_array_equal(moved(control, FACTOR, x, duration), forecast(control, FACTOR, x, F, duration)[0])
 
 
 def test_correction_moves_exterior_carriers_only_and_no_farther_than_its_limit():

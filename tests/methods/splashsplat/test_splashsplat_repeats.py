@@ -15,6 +15,7 @@ from splashbench.scene import Scene
 from splashbench_methods.splashsplat import SplashSplat
 from splashbench_methods.splashsplat.fields.repeats import repeated_frames
 from splashbench_methods.splashsplat.method import FittedSplashSplat
+from splashbench_methods.splashsplat.reconstruction import trace_liquid
 
 TINY = {"hull_cells": 40, "transport_cells": 20, "control_cells": 6, "iterations": 30, "voxel_pixels": 0}
 
@@ -49,11 +50,18 @@ def fit(directory: Path, **settings: object) -> tuple[FittedSplashSplat, Run]:
     return SplashSplat().fit(Scene.open(directory).training(), config, run), run
 
 
+def carriers(directory: Path) -> float:
+    """How many carriers there are in all, the mean of four seeds: one differs from the next by two per cent."""
+    config = SplashSplat.Config.preset("quick", TINY)
+    training = Scene.open(directory).training()
+    return float(np.mean([trace_liquid(training, config, Run(seed=seed)).track.carriers.count for seed in range(4)]))
+
+
 def test_a_recording_with_every_frame_twice_buys_nothing(doubled: Path, balls_directory: Path) -> None:
     once, _ = fit(balls_directory)
     twice, run = fit(doubled)
     assert run.notes["repeated frames"].startswith(f"{len(once.liquid.times)} of {len(twice.liquid.times)}")
-    assert twice.liquid.carriers.count == pytest.approx(once.liquid.carriers.count, rel=0.02)
+    assert carriers(doubled) == pytest.approx(carriers(balls_directory), rel=0.02)
     assert twice.liquid.stored_bytes < 1.1 * once.liquid.stored_bytes
     told_apart, _ = fit(doubled, repeats=False)
     assert told_apart.liquid.carriers.count > 1.3 * once.liquid.carriers.count

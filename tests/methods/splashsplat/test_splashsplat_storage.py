@@ -19,6 +19,8 @@ from splashbench_methods.splashsplat import SplashSplat
 from splashbench_methods.splashsplat.appearance.sensitivity import Sensitivities, Sensitivity
 from splashbench_methods.splashsplat.method import FittedSplashSplat
 from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.motion.steps import Motion
+from splashbench_methods.splashsplat.motion.velocity import factors
 from splashbench_methods.splashsplat.storage import rows, signed_distance, values
 from splashbench_methods.splashsplat.storage.tolerance import Trial, longest_step
 
@@ -274,3 +276,22 @@ def test_a_model_of_an_earlier_version_is_read_but_not_written(
     british = {name.replace("color", "colour"): head for name, head in heads.items()}
     np.savez(tmp_path / "appearance.npz", features=look.features.numpy(), log_scales=look.log_scales.numpy(), **british)
     torch.testing.assert_close(Liquid.load(tmp_path).appearance.decoder.state_dict(), look.decoder.state_dict())
+
+
+@pytest.mark.parametrize("factor", [4, (3.7, 4.2, 1.0)])
+def test_predictions_are_those_of_single_operations_in_double_precision(factor) -> None:
+    """Files are read by the same numbers that wrote them: here they are, written another way."""
+    rng = np.random.default_rng(0)
+    control = rng.integers(-600, 600, (9, 8, 11, 3)).astype(np.int16)
+    steps = rng.integers(0, 40 * rows.POSITION_STEPS, (20_000, 3))
+    wide = np.array(factors(factor), dtype=np.float64)
+    place = np.clip((steps / rows.POSITION_STEPS - 0.5 * (wide - 1)) / wide, 0, np.array(control.shape[:3]) - 1)
+    low = np.minimum(np.floor(place).astype(np.int64), np.array(control.shape[:3]) - 2)
+    sides = (1 - (place - low), place - low)
+    moved = np.zeros(steps.shape)
+    for a, b, c in np.ndindex(2, 2, 2):
+        weight = sides[a][:, 0] * sides[b][:, 1] * sides[c][:, 2]
+        moved = moved + weight[:, None] * control[low[:, 0] + a, low[:, 1] + b, low[:, 2] + c]
+    expected = steps + np.rint(moved * (rows.POSITION_STEPS / rows.VELOCITY_STEPS)).astype(np.int64)
+    found = rows._predicted(steps, control, Motion(control.astype(np.float32), factor, []))
+    np.testing.assert_array_equal(found, expected)
