@@ -26,7 +26,7 @@ from ..carriers.subframe import Track
 from ..kernel.window_loss import WindowPhotograph, window_losses
 from . import losses
 from .active import Active, ActiveCarriers
-from .averages import Averages
+from .averages import Averages, ShownHeads
 from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .glass import Glass, GlassFit, Splats
@@ -295,10 +295,10 @@ def fit_appearance(
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
 
-    offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, and the
-    carriers still fitted: bool [count]; and whether there will be no other for a while. settle: is called once, after
-    the share `plates_share`, to put the background behind `targets`. clock: where given, the fit ends when it has run
-    out, and `iterations` are the most that there are.
+    offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, but for
+    heads that are means over the last steps, and the carriers still fitted: bool [count]; and whether there will be no
+    other for a while. settle: is called once, after the share `plates_share`, to put the background behind `targets`.
+    clock: where given, the fit ends when it has run out, and `iterations` are the most that there are.
 
     Raises SplashbenchError where the loss stops being finite.
     """
@@ -338,6 +338,7 @@ def fit_appearance(
         if withheld_targets.any() or not adaptive.may_stop:
             schedule = adaptive
 
+    shown_heads = None if offer is None else ShownHeads(decoder)
     averages: Averages | None = None
     if isinstance(schedule, EarningSchedule) and schedule.withholds:
         averages = Averages(track.carriers.count, size, decoder)
@@ -395,7 +396,8 @@ def fit_appearance(
 
     @torch.no_grad()
     def state() -> tuple[Appearance, np.ndarray]:
-        look = Appearance(features.all(), appearance.log_scales, decoder, appearance.glass)
+        assert shown_heads is not None
+        look = Appearance(features.all(), appearance.log_scales, shown_heads.decoder(), appearance.glass)
         return look, carriers.left(track.carriers.count)
 
     @torch.no_grad()
@@ -478,6 +480,8 @@ def fit_appearance(
         for group in heads.param_groups:
             group["lr"] = settings.learning_rate_heads * factor
         heads.step()
+        if shown_heads is not None:
+            shown_heads.add()
         features.step(target.frame, by_feature, factor, active.places)
         scales.step(active.ids, by_scale, factor)
         if averages is not None and not schedule.withholds:

@@ -11,6 +11,7 @@ import torch
 from splashbench.render import freeze, rasterize_arrays
 from splashbench.scene import Camera
 from splashbench_methods.splashsplat.appearance import losses
+from splashbench_methods.splashsplat.appearance.averages import ShownHeads
 from splashbench_methods.splashsplat.appearance.decoder import Children, Decoder, DecoderSettings
 from splashbench_methods.splashsplat.appearance.fitting import composite
 from splashbench_methods.splashsplat.appearance.optimizer import RowAdam
@@ -191,3 +192,28 @@ def test_row_adam_moves_like_adam_and_leaves_other_rows_alone():
         ours.step(rows, gradient)
     np.testing.assert_allclose(table[rows], parameter.detach(), rtol=1e-5)
     assert torch.equal(table[[0, 2, 4]], start[[0, 2, 4]])
+
+
+def test_shown_heads_are_means_over_the_last_steps_and_a_decoder_of_their_own() -> None:
+    decoder = Decoder(DecoderSettings(feature_size=4, color_width=6))
+    shown = ShownHeads(decoder)
+    weight = decoder.opacity.weight
+    rng = np.random.default_rng(0)
+    values = []
+    for step in range(400):
+        with torch.no_grad():
+            # Steps to and fro about what the heads have found.
+            weight.fill_(1.0 + rng.normal())
+        values.append(float(weight[0, 0].detach()))
+        shown.add()
+        if step == 0:
+            torch.testing.assert_close(shown.decoder().opacity.weight, weight)
+    found = float(shown.decoder().opacity.weight[0, 0].detach())
+    assert abs(found - 1.0) < 0.5
+    share = 0.05
+    expected = sum(share * (1 - share) ** age * value for age, value in enumerate(values[::-1]))
+    assert found == pytest.approx(expected, abs=1e-4)
+    with torch.no_grad():
+        shown.decoder().opacity.weight.zero_()
+    assert float(weight[0, 0].detach()) == values[-1]
+    assert float(shown.decoder().opacity.weight[0, 0].detach()) == found
