@@ -116,12 +116,14 @@ def test_data_is_found_from_an_installed_wheel(wheel: Path, tmp_path: Path) -> N
 def test_compiled_kernels_are_loaded_from_an_installed_wheel(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path)
     code = (
+        "from splashbench.observe.carving import KERNEL as observe;"
         "from splashbench.render.native import KERNEL as renderer;"
         "from splashbench_methods.splashsplat.kernel.library import KERNEL as splashsplat;"
-        "[print(kernel.library._name, kernel.variant) for kernel in (renderer, splashsplat)]"
+        "[print(kernel.library._name, kernel.variant) for kernel in (observe, renderer, splashsplat)]"
     )
     environment = {"PYTHONPATH": str(tmp_path), "SPLASHBENCH_SIMD": "baseline", "SPLASHBENCH_KERNEL": ""}
     assert run_python(code, cwd=tmp_path, **environment).splitlines() == [
+        f"{tmp_path}/splashbench/observe/kernel/libobserve_baseline.so baseline",
         f"{tmp_path}/splashbench/render/kernel/librender_baseline.so baseline",
         f"{tmp_path}/splashbench_methods/splashsplat/kernel/libsplashsplat_baseline.so baseline",
     ]

@@ -40,7 +40,7 @@ _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "19"
+VERSION = "20"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -96,6 +96,8 @@ class SplashSplatConfig(MethodConfig):
     gate_motion: bool = True
     #: steps of the velocity's fit between two frames; 0 for no motion
     velocity_steps: int = Field(15, ge=0)
+    #: share of the mean error by which a step of the velocity's fit has to lower it, or the fit ends; 0 takes all steps
+    velocity_tolerance: float = Field(0.01, ge=0, lt=1)
     #: the fit of a step starts from the motion of the one before, not from none
     velocity_carry_on: bool = True
     #: share of the Gauss-Newton displacement that a step takes
@@ -216,6 +218,10 @@ class SplashSplatConfig(MethodConfig):
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
     idle_share: float = Field(0.02, ge=0, le=0.2)
+    #: how often each photograph is fitted to before it is looked for such carriers: until then opacities say little
+    idle_seen: PositiveInt = 4
+    #: the same in a transparent container, which is drawn with most carriers and was measured to gain by it
+    clear_idle_seen: PositiveInt = 1
     #: carriers begin with the colours in which the photographs show them, or else at random as in the paper
     first_look: bool = True
     #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
@@ -307,12 +313,14 @@ class SplashSplatConfig(MethodConfig):
             "anneal": False,
             "silhouette_norm": "image",
             "velocity_steps": 35,
+            "velocity_tolerance": 0.0,
             "velocity_carry_on": False,
             "composition": "together",
             "between_frames": "forward",
             "validation_share": 0.0,
             "prune_opacity": 0.0,
             "idle_share": 0.0,
+            "clear_idle_seen": 4,
             "coarse_share": 0.0,
             "coarsest_share": 0.0,
             "plates_share": 0.0,
@@ -384,6 +392,7 @@ class SplashSplatConfig(MethodConfig):
     def motion(self) -> MotionSettings:
         velocity = VelocitySettings(
             steps=self.velocity_steps,
+            tolerance=self.velocity_tolerance,
             step_size=self.velocity_step_size,
             band=self.velocity_band,
             smoothing=self.velocity_smoothing,
@@ -403,7 +412,12 @@ class SplashSplatConfig(MethodConfig):
 
     def in_transparent_container(self) -> SplashSplatConfig:
         """The settings where the liquid is in a transparent container."""
-        return self.model_copy(update={"shell_depth": min(self.shell_depth, self.clear_shell_depth)})
+        return self.model_copy(
+            update={
+                "shell_depth": min(self.shell_depth, self.clear_shell_depth),
+                "idle_seen": min(self.idle_seen, self.clear_idle_seen),
+            }
+        )
 
     def draft(self) -> SplashSplatConfig:
         """The settings of the draft: coarse carriers of each frame alone, and few iterations."""
@@ -488,6 +502,7 @@ class SplashSplatConfig(MethodConfig):
             base_scale=self.base_scale,
             prune_opacity=self.prune_opacity,
             idle_share=self.idle_share,
+            idle_seen=self.idle_seen,
             coarse_share=self.coarse_share,
             coarsest_share=self.coarsest_share,
             plates_share=self.plates_share,

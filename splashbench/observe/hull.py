@@ -12,8 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from splashbench.errors import SplashbenchError
+from splashbench.observe.carving import BLOCK, blocks_of, carve_view
 from splashbench.observe.grid import Bounds, Grid
-from splashbench.observe.kernels import BLOCK, blocks_of, carve_view, fill_blocks
+from splashbench.observe.kernels import fill_blocks
 from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion, focal_length
 from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
 from splashbench.parallel import each

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
+from splashbench.observe.carving import carve_hidden_view
 from splashbench.observe.container import depth_image, hidden, solid_distance
 from splashbench.observe.grid import Grid
-from splashbench.observe.kernels import carve_hidden_view
 from splashbench.observe.silhouettes import NO_EVIDENCE, ImageWindow, Silhouettes, inner_distance, signed_distance_2d
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh

@@ -19,8 +19,9 @@ from splashbench.observe import (
     sequence_bounds,
     signed_distance_fields,
 )
+from splashbench.observe.carving import carve_view
 from splashbench.observe.container import depth_image, hidden, hidden_share, solid_distance
-from splashbench.observe.kernels import carve_view, fill_blocks
+from splashbench.observe.kernels import fill_blocks
 from splashbench.observe.occlusion import CarvingOcclusion
 from splashbench.scene import Camera, ContainerMesh, look_at
 

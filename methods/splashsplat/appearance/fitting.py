@@ -58,10 +58,8 @@ _BEFORE = 1500
 _FALL = 0.5
 # When transparent carriers are left out, as shares of the iterations: not in the last fifth, which makes up for them.
 _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
-# When it is looked at anew what makes up each photograph, likewise; and not before each was seen so many times: until
-# then opacities say little.
-_FOCUSINGS = (0.2, 0.4, 0.6, 0.8)
-_SEEN_BEFORE = 4
+# When it is looked at anew what makes up each photograph, likewise; and not before each was seen `idle_seen` times.
+_FOCUSINGS = (0.1, 0.2, 0.4, 0.6, 0.8)
 # After so many iterations, and after each that drew so many pixels, what the heap holds of freed images is given back.
 _GIVE_BACK_EVERY, _GIVE_BACK_PIXELS = 25, 1 << 20
 # Share of the photographs that were seen before a state is shown. On opaque_bowl it is better than the draft then, in
@@ -77,7 +75,9 @@ class FitSettings:
     anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. validation_share: of the
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
     `AdaptiveSchedule`. price: see `EarningSchedule`, which is taken where it is above 0. prune_opacity: carriers whose
-    learned opacity is below this at one of `_PRUNINGS` are not fitted any further; 0 fits all to the end.
+    learned opacity is below this at one of `_PRUNINGS` are not fitted any further; 0 fits all to the end. idle_share:
+    carriers that together make up no more of a photograph are not fitted to it, as seen at one of `_FOCUSINGS`;
+    idle_seen: how often each was fitted to before the first, as opacities say little until then.
     feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is that of the shared parts. coarse_share: of
     the iterations, the first ones, that see targets at half their size where these have one; coarsest_share: of all,
     the first ones, that see them at a quarter. plates_share: of the iterations, the first ones, for which the
@@ -100,6 +100,7 @@ class FitSettings:
     base_scale: float = 0.35
     prune_opacity: float = 0.0
     idle_share: float = 0.0
+    idle_seen: int = 4
     coarse_share: float = 0.0
     coarsest_share: float = 0.0
     plates_share: float = 0.0
@@ -450,7 +451,11 @@ def fit_appearance(
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
             carriers.drop(decoder.mean_opacity(features.all()).detach() < settings.prune_opacity)
             features.keep(carriers.ids)
-        if settings.idle_share > 0 and focusings.come(iteration, schedule) and iteration >= _SEEN_BEFORE * len(targets):
+        if (
+            settings.idle_share > 0
+            and focusings.come(iteration, schedule)
+            and iteration >= settings.idle_seen * len(targets)
+        ):
             carriers.focus(idle, targets)
             features.keep(carriers.ids)
         target = targets[queue.pop()]

@@ -38,7 +38,7 @@ Report = Callable[[float, str], None]
 _SHARE_OF_OBSERVABLE = 0.45
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 10
+_REVISION = 11
 
 
 @dataclass(frozen=True)
