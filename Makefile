@@ -26,7 +26,7 @@ help:
 	@echo "make test-all    run every test (those without a CUDA device to run on skip)"
 	@echo "make lint        check style, types, and which part imports which"
 	@echo "make docs        build the documentation site into site/; open site/index.html"
-	@echo "make pictures    draw the pictures of README.md and of the site anew; fits two methods first, which takes long"
+	@echo "make pictures    draw the pictures of README.md and of the site anew, but for charts; fits methods first, which takes long"
 	@echo "make leaderboard  make the page of the project's own results anew, and say which figures changed"
 	@echo "make wheel       build the wheel into dist/"
 	@echo "make kernel      build the compiled kernels in place, after an edit"

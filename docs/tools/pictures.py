@@ -1,12 +1,11 @@
-"""`make pictures`: every picture of README.md and of the site, drawn anew into docs/images.
+"""`make pictures`: every picture of README.md and of the site but for charts, drawn anew into docs/images.
 
-A scene and fits go into build/pictures; what is there already is kept. The speed-against-accuracy chart is drawn
-from leaderboards/synthetic.csv alone. `python docs/tools/pictures.py chart` draws one of the groups below.
+Scenes and fits go into build/pictures; what is there already is kept. `python docs/tools/pictures.py test_view` draws
+one of the groups below. Charts of results are drawn by docs/results/charts.py.
 """
 
 from __future__ import annotations
 
-import csv
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -26,14 +25,9 @@ from splashbench.container.verification import overlay
 from splashbench.dyes import DYES
 from splashbench.errors import SplashbenchError
 from splashbench.replay import load
-from splashbench.report.charts import speed_accuracy_chart
 from splashbench.report.contact_sheet import contact_sheet
-from splashbench.report.results import ResultFile
 from splashbench.restyle import filmed_dye, restyled
 from splashbench.scene import Scene
-from splashbench.score.metrics import METRICS
-from splashbench.score.result import Digests, Result, metric_value
-from splashbench.score.settings import PROTOCOL_V1
 from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
 from splashbench.study.perturbations.setup import MissingCameras
 from splashbench.study.perturbations.timesteps import FewerTimesteps
@@ -49,12 +43,8 @@ ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
 WORK = ROOT / "build" / "pictures"
 SCENE = WORK / "scene"
-LEADERBOARD = ROOT / "leaderboards" / "synthetic.csv"
-#: Settings of the rows of the leaderboard in which splashsplat is told masks alone (leaderboards/README.md).
-MASKS_ALONE = "28265025"
+POUR = ("synth", "scene", "opaque_bowl")
 METHODS = {"splashsplat": "SplashSplat (this project)", "scaffold_4d": "4D-Scaffold-GS (best baseline)"}
-#: Far below and left of what the chart is about; the table beside it has them.
-FAR_OFF = ("hull_points", "nearest_camera", "nothing")
 VIEW, FRAME = "6", 8
 ORANGE, BLUE = "#E69F00", "#0072B2"
 
@@ -76,13 +66,26 @@ def made(folder: Path, *command: str) -> Path:
 
 
 def fits() -> tuple[Scene, dict[str, Submission]]:
-    """The synthetic scene, and the methods of METHODS on it."""
-    made(SCENE, "synth", "scene", "opaque_bowl", str(SCENE), "--size", "480x320", "--timesteps", "12")
+    """The synthetic scene, and the methods of METHODS on it, by their presets `quick`."""
+    made(SCENE, *POUR, str(SCENE), "--size", "480x320", "--timesteps", "12")
     submissions = {}
     for name in METHODS:
         out = WORK / "submissions" / name
         submissions[name] = Submission.open(made(out, "run", name, str(SCENE), str(out), "--preset", "quick"))
     return Scene.open(SCENE), submissions
+
+
+def fits_told_nothing() -> tuple[Scene, dict[str, Submission]]:
+    """The same pour, whose scene tells the times alone; splashsplat by `best`, and the rival at full size."""
+    folder = WORK / "told_nothing"
+    size = ["--size", "480x320", "--timesteps", "12", "--times-alone"]
+    scene = made(folder / "scene", *POUR, str(folder / "scene"), *size)
+    settings = {"splashsplat": ["--preset", "best"], "scaffold_4d": ["--preset", "quick", "--set", "longest_side=480"]}
+    submissions = {}
+    for name in METHODS:
+        out = folder / name
+        submissions[name] = Submission.open(made(out, "run", name, str(scene), str(out), *settings[name]))
+    return Scene.open(scene), submissions
 
 
 def store(figure: Figure, name: str, dpi: int = 150, colours: int = 256) -> Path:
@@ -123,7 +126,7 @@ def window(mask: NDArray[np.bool_], margin: int = 14) -> tuple[slice, slice]:
 
 def test_view() -> list[Path]:
     """The first picture of README.md: truth, splashsplat, the best baseline, and the liquid's opacity below."""
-    scene, submissions = fits()
+    scene, submissions = fits_told_nothing()
     mask = scene.mask(VIEW, FRAME)
     crop = window(mask)
     columns = [("truth", scene.image(VIEW, FRAME), mask.astype(np.float32))]
@@ -138,37 +141,6 @@ def test_view() -> list[Path]:
     grid[0, 0].set_ylabel("picture")
     grid[1, 0].set_ylabel("opacity of the liquid")
     return [store(figure, "test_view.png", 110)]
-
-
-def chart() -> list[Path]:
-    """The speed-against-accuracy chart of the committed leaderboard."""
-    with LEADERBOARD.open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["method"] not in FAR_OFF]
-    sources = [ResultFile(f"{i}.json", result_of(row)) for i, row in enumerate(rows)]
-    drawn, unused = speed_accuracy_chart(sources, IMAGES)
-    unused.unlink()
-    return [shrink(drawn, drawn, 1250)]
-
-
-def result_of(row: dict[str, str]) -> Result:
-    """A row of the leaderboard as a result: its medians, under the name that the chart is to show."""
-    alone = row["settings_digest"] == MASKS_ALONE
-    cpu, _, cores = row["hardware"].rpartition(", ")
-    figures = {name: float(row[name]) if row.get(name) else None for name in METRICS}
-    return Result(
-        method=row["method"] + (", masks alone" if alone else ""),
-        method_version=row["method_version"],
-        scene=row["scene"],
-        seed=0,
-        preset=row["preset"],
-        control=row["control"] == "true",
-        mixed=row["mixed"] == "true",
-        status=row["status"],
-        protocol=PROTOCOL_V1,
-        digests=Digests(scene=row["scene_digest"], submission=row["settings_digest"], protocol=PROTOCOL_V1.digest),
-        metrics={name: metric_value(name, value, "not in the leaderboard") for name, value in figures.items()},
-        hardware={"cpu": cpu, "cores": int(cores.split()[0])},
-    )
 
 
 def method() -> list[Path]:
@@ -429,7 +401,6 @@ def dyes() -> list[Path]:
 
 #: What `main` draws, by name.
 GROUPS: dict[str, Callable[[], list[Path]]] = {
-    "chart": chart,
     "test_view": test_view,
     "method": method,
     "vessels": vessels,

@@ -90,7 +90,8 @@ def trace_liquid(
     observations = observe(scene, config.fields, run, run.progress, known)
     if observations.in_transparent_container:
         config = config.in_transparent_container()
-        run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent")
+        sooner = ", and idle carriers are looked for sooner" if config.idle_early else ""
+        run.note("shell", f"{config.shell_depth:g} voxels, as the container is transparent{sooner}")
     track = _track(observations, scene, config, run, run.progress)
     with run.stage("carriers"):
         memory.give_back()

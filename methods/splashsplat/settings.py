@@ -96,8 +96,6 @@ class SplashSplatConfig(MethodConfig):
     gate_motion: bool = True
     #: steps of the velocity's fit between two frames; 0 for no motion
     velocity_steps: int = Field(15, ge=0)
-    #: share of the mean error by which a step of the velocity's fit has to lower it, or the fit ends; 0 takes all steps
-    velocity_tolerance: float = Field(0.01, ge=0, lt=1)
     #: the fit of a step starts from the motion of the one before, not from none
     velocity_carry_on: bool = True
     #: share of the Gauss-Newton displacement that a step takes
@@ -218,10 +216,10 @@ class SplashSplatConfig(MethodConfig):
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
     idle_share: float = Field(0.02, ge=0, le=0.2)
-    #: how often each photograph is fitted to before it is looked for such carriers: until then opacities say little
-    idle_seen: PositiveInt = 4
-    #: the same in a transparent container, which is drawn with most carriers and was measured to gain by it
-    clear_idle_seen: PositiveInt = 1
+    #: such carriers are looked for a tenth of the iterations in already, not from a fifth on
+    idle_early: bool = False
+    #: the same in a transparent container; violent liquid in an opaque one loses by it, as opacities say little so soon
+    clear_idle_early: bool = True
     #: carriers begin with the colours in which the photographs show them, or else at random as in the paper
     first_look: bool = True
     #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
@@ -313,14 +311,13 @@ class SplashSplatConfig(MethodConfig):
             "anneal": False,
             "silhouette_norm": "image",
             "velocity_steps": 35,
-            "velocity_tolerance": 0.0,
             "velocity_carry_on": False,
             "composition": "together",
             "between_frames": "forward",
             "validation_share": 0.0,
             "prune_opacity": 0.0,
             "idle_share": 0.0,
-            "clear_idle_seen": 4,
+            "clear_idle_early": False,
             "coarse_share": 0.0,
             "coarsest_share": 0.0,
             "plates_share": 0.0,
@@ -392,7 +389,6 @@ class SplashSplatConfig(MethodConfig):
     def motion(self) -> MotionSettings:
         velocity = VelocitySettings(
             steps=self.velocity_steps,
-            tolerance=self.velocity_tolerance,
             step_size=self.velocity_step_size,
             band=self.velocity_band,
             smoothing=self.velocity_smoothing,
@@ -415,7 +411,7 @@ class SplashSplatConfig(MethodConfig):
         return self.model_copy(
             update={
                 "shell_depth": min(self.shell_depth, self.clear_shell_depth),
-                "idle_seen": min(self.idle_seen, self.clear_idle_seen),
+                "idle_early": self.idle_early or self.clear_idle_early,
             }
         )
 
@@ -502,7 +498,7 @@ class SplashSplatConfig(MethodConfig):
             base_scale=self.base_scale,
             prune_opacity=self.prune_opacity,
             idle_share=self.idle_share,
-            idle_seen=self.idle_seen,
+            idle_early=self.idle_early,
             coarse_share=self.coarse_share,
             coarsest_share=self.coarsest_share,
             plates_share=self.plates_share,

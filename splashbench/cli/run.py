@@ -12,7 +12,7 @@ from splashbench.cli.output import emit, say
 
 if TYPE_CHECKING:
     from splashbench.scene import Scene, SignedDistance
-    from splashbench.submission import Budget, Record, Submission
+    from splashbench.submission import Budget, Submission
 
 _EPILOG = """\
 examples:
@@ -134,25 +134,6 @@ def _oracle_geometry(scene: Scene) -> SignedDistance | None:
     return oracle_geometry(scene)
 
 
-def _not_kept(budget: Budget | None, record: Record) -> list[str]:
-    """What of a budget the run went over, by more than methods may, in words."""
-    from splashbench.submission.budget import TOLERATED
-
-    if budget is None:
-        return []
-    used = {
-        "seconds": (record.fit_seconds, 1.0, "s"),
-        "storage_bytes": (record.storage_bytes, 1e6, "MB of storage"),
-        "memory_bytes": (record.peak_memory_bytes, 1e6, "MB of memory"),
-    }
-    return [
-        f"a budget of {limit / unit:.3g} {name} could not be kept: {found / unit:.3g}"
-        for key, limit in budget.limits.items()
-        for found, unit, name in [used[key]]
-        if found is not None and found > (1 + TOLERATED) * limit
-    ]
-
-
 def report_submission(submission: Submission, arguments: argparse.Namespace) -> int:
     """Print how a run ended, as JSON too where it is asked for; returns the exit status."""
     from splashbench.errors import one_line
@@ -166,7 +147,8 @@ def report_submission(submission: Submission, arguments: argparse.Namespace) -> 
             f"see {arguments.out / 'record.json'}"
         )
         return 1
-    for words in _not_kept(identity.budget, record):
+    costs = record.fit_seconds, record.storage_bytes, record.peak_memory_bytes
+    for words in identity.budget.exceeded(*costs) if identity.budget else []:
         say(f"warning: {identity.method}: {words}")
     cost = f", fit in {record.fit_seconds:.1f} s" if record.fit_seconds is not None else ""
     say(f"{identity.method}: ok{cost}; submission in {arguments.out}")

@@ -82,6 +82,8 @@ def carve_view(
 
     Raises TypeError or ValueError naming the argument.
     """
+    if silhouette.ndim != 2 or min(silhouette.shape) < 2:
+        raise ValueError(f"silhouette is {list(silhouette.shape)}, not an image with sides of 2 pixels or more")
     # A view from which nothing is hidden.
     carve_hidden_view(
         phi,
@@ -120,19 +122,25 @@ def carve_hidden_view(
     depths from starts[k - 1] on (starts: [K], scene units, rising). nearest: float32 [h, w], depth of the occluder. A
     point that is hidden at its own depth looks one layer deeper, where its pixel is hidden too.
 
-    second: float32 [nx, ny, nz], nowhere above phi; where given, phi collects the largest and `second` the second
-    largest value of all views that are added one after the other, instead of the maximum alone.
+    second: float32 [nx, ny, nz]; where given, phi collects the largest and `second` the second largest value of all
+    views that are added one after the other, instead of the maximum alone. Both begin at -`limit`, and a view says
+    nothing of points behind its camera.
     """
-    layers, nearest = (np.ascontiguousarray(image, np.float32) for image in (layers, nearest))
     starts = np.ascontiguousarray(starts, np.float64)
+    origin, projection, corner = (np.asarray(place, np.float64) for place in (origin, projection, corner))
     blocks = None if blocks is None else np.ascontiguousarray(blocks, np.bool_)
     for name, field in (("phi", phi), ("second", second)):
         if field is not None and (field.dtype != np.float32 or not field.flags.c_contiguous):
             raise TypeError(f"{name} is not contiguous float32")
+        if field is not None and not field.flags.writeable:
+            raise ValueError(f"{name} is read-only")
     if phi.ndim != 3:
         raise ValueError(f"phi has {phi.ndim} dimensions, not 3")
-    if layers.ndim != 3 or min(layers.shape[1:]) < 2 or layers.size > _MOST_PIXELS:
-        raise ValueError(f"layers are {list(layers.shape)}, of which each side of an image is 2 or more")
+    if layers.ndim != 3 or min(layers.shape) < 1 or min(layers.shape[1:]) < 2:
+        raise ValueError(f"layers are {list(layers.shape)}, not one image or more with sides of 2 pixels or more")
+    if layers.size > _MOST_PIXELS:
+        raise ValueError(f"layers have {layers.size} pixels, more than {_MOST_PIXELS}")
+    layers, nearest = (np.ascontiguousarray(image, np.float32) for image in (layers, nearest))
     wanted = {
         "second": (second, phi.shape),
         "blocks": (blocks, blocks_of(phi.shape)),

@@ -20,6 +20,20 @@ class Budget(BaseModel):
     storage_bytes: int | None = Field(default=None, gt=0, le=10**15)
     memory_bytes: int | None = Field(default=None, gt=0, le=10**15)
 
+    def exceeded(self, seconds: float | None, storage_bytes: int | None, memory_bytes: int | None) -> list[str]:
+        """A line for each limit that a run of these costs went over by more than methods may; None: not measured."""
+        used = {
+            "seconds": (seconds, 1.0, "s"),
+            "storage_bytes": (storage_bytes, 1e6, "MB of storage"),
+            "memory_bytes": (memory_bytes, 1e6, "MB of memory"),
+        }
+        return [
+            f"a budget of {limit / unit:.3g} {name} could not be kept: {found / unit:.3g}"
+            for key, limit in self.limits.items()
+            for found, unit, name in [used[key]]
+            if found is not None and found > (1 + TOLERATED) * limit
+        ]
+
     @property
     def limits(self) -> dict[str, float]:
         """Those that are given, by name."""

@@ -85,3 +85,15 @@ def test_the_clock_of_a_run_goes_on() -> None:
     run = Run()
     first = run.seconds
     assert 0 <= first <= run.seconds < 5
+
+
+def test_what_of_a_budget_was_not_kept() -> None:
+    budget = Budget(seconds=10, storage_bytes=2_000_000, memory_bytes=300_000_000)
+    assert budget.exceeded(10.5, 2_100_000, 315_000_000) == []
+    assert budget.exceeded(None, None, None) == []
+    assert budget.exceeded(10.6, 2_200_000, 400_000_000) == [
+        "a budget of 10 s could not be kept: 10.6",
+        "a budget of 2 MB of storage could not be kept: 2.2",
+        "a budget of 300 MB of memory could not be kept: 400",
+    ]
+    assert Budget().exceeded(1e9, 10**15, 10**15) == []

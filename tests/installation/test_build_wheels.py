@@ -104,7 +104,11 @@ def test_a_source_archive_needs_no_compiler(checkout: Path, tmp_path: Path) -> N
 
 IN_TREE = {
     f"{folder}/kernel/lib{name}_{variant}.so"
-    for folder, name in (("splashbench/render", "render"), ("methods/splashsplat", "splashsplat"))
+    for folder, name in (
+        ("splashbench/observe", "observe"),
+        ("splashbench/render", "render"),
+        ("methods/splashsplat", "splashsplat"),
+    )
     for variant in ("baseline", "avx2", "avx512")
 }
 LIBRARIES = {path.replace("methods/", "splashbench_methods/") for path in IN_TREE}  # as they are installed

@@ -64,6 +64,16 @@ def nodes_of(blocks: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     return wanted[: shape[0], : shape[1], : shape[2]]
 
 
+@pytest.fixture(params=KERNEL.built_variants())
+def variant(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The kernel of one variant after the other."""
+    if not KERNEL.runs(request.param):
+        pytest.skip(f"this processor does not run {request.param}")
+    monkeypatch.setitem(KERNEL.__dict__, "library", KERNEL.open_variant(request.param))
+    return str(request.param)
+
+
+@pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("seed", range(9))
 @pytest.mark.parametrize("layers", [0, 3])
 def test_a_view_says_what_numpy_says(seed: int, layers: int) -> None:
@@ -94,11 +104,17 @@ def test_the_second_largest_is_kept_too(seed: int) -> None:
     np.testing.assert_allclose(second, ranked[-2], atol=2e-4)
 
 
-@pytest.mark.parametrize("variant", KERNEL.built_variants())
-def test_threads_and_blocks_change_no_bit(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not KERNEL.runs(variant):
-        pytest.skip(f"this processor does not run {variant}")
-    monkeypatch.setitem(KERNEL.__dict__, "library", KERNEL.open_variant(variant))
+@pytest.mark.parametrize("shape", [(0, 5, 5), (5, 5, 0), (1, 1, 1), (1, 7, 65), (5, 1, 64), (6, 6, 1)])
+def test_grids_of_any_size(shape: tuple[int, int, int]) -> None:
+    view = View(4, shape)
+    phi = np.full(shape, -LIMIT, np.float32)
+    view.carve(phi)
+    distance, ahead = view.distances()
+    np.testing.assert_allclose(phi, np.where(ahead, distance, LIMIT), atol=2e-4)
+
+
+@pytest.mark.usefixtures("variant")
+def test_threads_and_blocks_change_no_bit() -> None:
     view = View(5, (23, 19, 301))
     whole = np.full(view.shape, -LIMIT, np.float32)
     with use_threads(1):
@@ -110,18 +126,46 @@ def test_threads_and_blocks_change_no_bit(variant: str, monkeypatch: pytest.Monk
     np.testing.assert_array_equal(parts, whole)
 
 
+@pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e308, 0.0])
-def test_a_camera_that_is_none_reads_nothing_beside_the_image(value: float) -> None:
+def test_a_camera_that_is_none_reads_nothing_beside_the_images(value: float) -> None:
+    """All images of the view hold one value, and what lies before and after them in memory no number: what is said is
+    linear in that value."""
     view = View(1)
+    around = np.full((len(view.layers) + 2, *view.nearest.shape), 1e30, np.float32)
+    layers = around[1:-1]
     for row in range(3):
         for column in range(4):
             projection = view.camera.projection.copy()
             projection[row, column] = value
-            phi = np.zeros(view.shape, np.float32)
-            depths = (view.layers, view.corner, view.nearest, view.starts, 0.03)
-            carve_hidden_view(phi, view.origin, view.voxel, projection, view.focal, *depths, LIMIT)
-            assert (phi >= 0).all()
-            assert (phi <= LIMIT).all()
+            said = []
+            for everywhere in (-1, 0, 1):
+                layers[:] = everywhere
+                phi = np.full(view.shape, -LIMIT, np.float32)
+                depths = (layers, view.corner, view.nearest, view.starts, 0.03)
+                carve_hidden_view(phi, view.origin, view.voxel, projection, view.focal, *depths, LIMIT)
+                assert np.abs(phi).max() <= LIMIT
+                said.append(phi)
+            unclipped = np.max(np.abs(said), axis=0) < LIMIT
+            low, middle, high = (phi[unclipped] for phi in said)
+            np.testing.assert_allclose(low + high, 2 * middle, atol=1e-4)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("name", ["layers", "nearest", "starts"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_images_and_depths_that_are_no_numbers_leave_numbers(name: str, value: float) -> None:
+    view = View(2)
+    getattr(view, name).reshape(-1)[::3] = value
+    phi = np.full(view.shape, -LIMIT, np.float32)
+    view.carve(phi)
+    assert np.isfinite(phi).all()
+
+
+def read_only() -> np.ndarray:
+    field = np.zeros((3, 3, 3), np.float32)
+    field.flags.writeable = False
+    return field
 
 
 @pytest.mark.parametrize(
@@ -130,11 +174,15 @@ def test_a_camera_that_is_none_reads_nothing_beside_the_image(value: float) -> N
         ({"phi": np.zeros((3, 3, 3))}, TypeError, "phi"),
         ({"phi": np.zeros((3, 3, 6), np.float32)[..., ::2]}, TypeError, "phi"),
         ({"phi": np.zeros((3, 3), np.float32)}, ValueError, "phi"),
+        ({"phi": read_only()}, ValueError, "phi"),
+        ({"second": read_only()}, ValueError, "second"),
         ({"second": np.zeros((3, 3, 2), np.float32)}, ValueError, "second"),
         ({"second": np.zeros((3, 3, 3))}, TypeError, "second"),
         ({"layers": np.zeros((3, 9, 9), np.float32)}, ValueError, "starts"),
         ({"layers": np.zeros((2, 1, 9), np.float32)}, ValueError, "layers"),
         ({"layers": np.zeros((9, 9), np.float32)}, ValueError, "layers"),
+        ({"layers": np.zeros((0, 9, 9), np.float32)}, ValueError, "layers"),
+        ({"layers": np.broadcast_to(np.float32(0), (2, 2**16, 2**15))}, ValueError, "layers"),
         ({"nearest": np.zeros((9, 8), np.float32)}, ValueError, "nearest"),
         ({"projection": np.eye(3)}, ValueError, "projection"),
         ({"origin": np.zeros(2)}, ValueError, "origin"),
@@ -162,7 +210,7 @@ def test_what_does_not_fit_together_is_named(change: dict, error: type[Exception
 
 
 def test_an_image_of_one_row_is_refused() -> None:
-    with pytest.raises(ValueError, match="2 or more"):
+    with pytest.raises(ValueError, match=r"^silhouette is \[1, 9\]"):
         carve_view(
             np.zeros((3, 3, 3), np.float32),
             np.zeros(3),

@@ -58,8 +58,11 @@ _BEFORE = 1500
 _FALL = 0.5
 # When transparent carriers are left out, as shares of the iterations: not in the last fifth, which makes up for them.
 _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
-# When it is looked at anew what makes up each photograph, likewise; and not before each was seen `idle_seen` times.
-_FOCUSINGS = (0.1, 0.2, 0.4, 0.6, 0.8)
+# When it is looked at anew what makes up each photograph, likewise; and not before each was seen so many times: until
+# then opacities say little.
+_FOCUSINGS, _SEEN_BEFORE = (0.2, 0.4, 0.6, 0.8), 4
+# The same with `idle_early`.
+_EARLY_FOCUSINGS, _SEEN_BEFORE_EARLY = (0.1, *_FOCUSINGS), 1
 # After so many iterations, and after each that drew so many pixels, what the heap holds of freed images is given back.
 _GIVE_BACK_EVERY, _GIVE_BACK_PIXELS = 25, 1 << 20
 # Share of the photographs that were seen before a state is shown. On opaque_bowl it is better than the draft then, in
@@ -76,8 +79,8 @@ class FitSettings:
     photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
     `AdaptiveSchedule`. price: see `EarningSchedule`, which is taken where it is above 0. prune_opacity: carriers whose
     learned opacity is below this at one of `_PRUNINGS` are not fitted any further; 0 fits all to the end. idle_share:
-    carriers that together make up no more of a photograph are not fitted to it, as seen at one of `_FOCUSINGS`;
-    idle_seen: how often each was fitted to before the first, as opacities say little until then.
+    carriers that together make up no more of a photograph than this are not fitted to it; which they are is looked at
+    at `_FOCUSINGS`. idle_early: at `_EARLY_FOCUSINGS` instead, and once each photograph was seen a single time.
     feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is that of the shared parts. coarse_share: of
     the iterations, the first ones, that see targets at half their size where these have one; coarsest_share: of all,
     the first ones, that see them at a quarter. plates_share: of the iterations, the first ones, for which the
@@ -100,7 +103,7 @@ class FitSettings:
     base_scale: float = 0.35
     prune_opacity: float = 0.0
     idle_share: float = 0.0
-    idle_seen: int = 4
+    idle_early: bool = False
     coarse_share: float = 0.0
     coarsest_share: float = 0.0
     plates_share: float = 0.0
@@ -422,9 +425,8 @@ def fit_appearance(
         return target
 
     reader = ReadAhead()
-    prunings, focusings = (
-        _Moments(shares, settings.iterations, clock is not None) for shares in (_PRUNINGS, _FOCUSINGS)
-    )
+    looks, seen_before = (_EARLY_FOCUSINGS, _SEEN_BEFORE_EARLY) if settings.idle_early else (_FOCUSINGS, _SEEN_BEFORE)
+    prunings, focusings = (_Moments(shares, settings.iterations, clock is not None) for shares in (_PRUNINGS, looks))
     shown_from = round(_SHOWN_FROM * len(targets))
     queue: list[int] = []
     history: list[float] = []
@@ -451,11 +453,7 @@ def fit_appearance(
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
             carriers.drop(decoder.mean_opacity(features.all()).detach() < settings.prune_opacity)
             features.keep(carriers.ids)
-        if (
-            settings.idle_share > 0
-            and focusings.come(iteration, schedule)
-            and iteration >= settings.idle_seen * len(targets)
-        ):
+        if settings.idle_share > 0 and focusings.come(iteration, schedule) and iteration >= seen_before * len(targets):
             carriers.focus(idle, targets)
             features.keep(carriers.ids)
         target = targets[queue.pop()]

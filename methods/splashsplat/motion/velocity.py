@@ -34,11 +34,9 @@ Factor = int | tuple[float, float, float]
 @dataclass(frozen=True)
 class VelocitySettings:
     """Settings of the fit; the defaults are the paper's, except `smooth` and `smoothing_unit`, whose voxels `smoothing`
-    is in: the "control" grid's cells or "transport" voxels. steps: at most; tolerance: share of the residual by which
-    one has to lower it, or is the last, 0 for none; one that raises it is taken back then."""
+    is in: the "control" grid's cells or "transport" voxels."""
 
     steps: int = 35
-    tolerance: float = 0.0
     step_size: float = 0.45
     band: float = 4.0
     smoothing: float = 0.6
@@ -285,29 +283,21 @@ def fit_velocity(
     divergence_free = DivergenceFree(coarse, voxels)
     descent = Descent(with_gradient(before), after, nodes, starts, coarse, voxels)
 
-    def stepped(update: np.ndarray) -> np.ndarray:
+    first = None
+    for _ in range(settings.steps):
+        update, residual = descent.step(control, settings.step_size)
+        first = residual if first is None else first
         if settings.smooth == "update":
             # Normalised by the equally smoothed count: cells without band nodes take their neighbours' motion.
-            moved = control + _smoothed(update, sigma) / weight
+            control += _smoothed(update, sigma) / weight
         else:
-            moved = _smoothed(control + update / np.maximum(counts, 1), sigma)
+            control = _smoothed(control + update / np.maximum(counts, 1), sigma)
         blend = settings.projection_blend
-        moved = (1 - blend) * moved + blend * divergence_free(moved)
-        speed = np.sqrt((moved**2).sum(axis=-1, keepdims=True))
-        return np.ascontiguousarray(moved * np.minimum(1, settings.limit / np.maximum(speed, 1e-6)), dtype=np.float32)
-
-    update, residual = descent.step(control, settings.step_size)
-    first = residual
-    for _ in range(settings.steps):
-        moved = stepped(update)
-        update, reached = descent.step(moved, settings.step_size)
-        if settings.tolerance > 0 and reached > residual:
-            break
-        enough = reached > (1 - settings.tolerance) * residual
-        control, residual = moved, reached
-        if settings.tolerance > 0 and enough:
-            break
-    return VelocityFit(control, first, residual)
+        control = (1 - blend) * control + blend * divergence_free(control)
+        speed = np.sqrt((control**2).sum(axis=-1, keepdims=True))
+        slowed = control * np.minimum(1, settings.limit / np.maximum(speed, 1e-6))
+        control = np.ascontiguousarray(slowed, dtype=np.float32)
+    return VelocityFit(control, first or 0.0, descent.step(control, settings.step_size)[1])
 
 
 def _smoothed(field: np.ndarray, sigma: tuple[float, ...]) -> np.ndarray:

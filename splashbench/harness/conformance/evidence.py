@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from splashbench.harness.devices import chosen_device
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.runner import run_method
 from splashbench.scene import Scene
-from splashbench.submission import Checkpoint, Status, check_submission
+from splashbench.submission import Budget, Record, Status, check_submission
 from splashbench.synth.balls import write_balls_scene
 
 SEED, OTHER_SEED = 0, 1
@@ -27,22 +28,31 @@ SEED, OTHER_SEED = 0, 1
 _QUICK = "quick"
 #: When states are taken, as shares of the fit; one of them early, since methods tend to change their ways.
 _CHECKPOINTS = (0.05, 0.6)
+#: Of what a run without limits took, as much as a run with limits may take.
+_BUDGET_SHARE = 0.6
+#: Fits that may take fewer seconds than these do hardly more than start.
+_LEAST_SECONDS = 2.0
 
 
 @dataclass
 class OrdinaryRun:
-    """A run through the harness: its status and reason, and the model that it left. seconds: rendering included."""
+    """A run through the harness: its status and reason, and the model that it left. seconds: rendering included.
+    record: None where there was no run."""
 
     status: str
     reason: str
-    fit_seconds: float
     seconds: float
     model: Path
-    checkpoints: Sequence[Checkpoint] = ()
+    record: Record | None = None
 
     @property
     def ok(self) -> bool:
         return self.status == Status.OK.value
+
+    @property
+    def fit_seconds(self) -> float:
+        """Of the fit; 0 where it was not measured."""
+        return (self.record.fit_seconds if self.record else None) or 0.0
 
 
 class Evidence:
@@ -126,10 +136,36 @@ class Evidence:
         marks = [share * self.run.fit_seconds for share in _CHECKPOINTS]
         return self._run("checkpointed", "the run with checkpoints", marks)
 
-    def _run(self, name: str, what: str, checkpoints: Sequence[float] | None = None) -> OrdinaryRun:
+    @cached_property
+    def budget(self) -> Budget:
+        """Less than the ordinary run took, of the seconds and bytes that the method keeps to; None for what cannot be
+        tried: fits that are short already, and what was not measured."""
+        record = self.run.record
+        if record is None or not self.run.ok:
+            return Budget()
+        keeps, seconds, storage = self.method.budgets, record.fit_seconds, record.storage_bytes
+        seconds = _BUDGET_SHARE * seconds if seconds and "seconds" in keeps else None
+        return Budget(
+            seconds=seconds if seconds and seconds >= _LEAST_SECONDS else None,
+            storage_bytes=math.ceil(_BUDGET_SHARE * storage) if storage and "storage_bytes" in keeps else None,
+        )
+
+    @cached_property
+    def budgeted(self) -> OrdinaryRun:
+        """The same run, with that budget."""
+        return self._run("budgeted", "the run with a budget", budget=self.budget)
+
+    @cached_property
+    def budgeted_again(self) -> OrdinaryRun:
+        """And once more: what else a machine does makes one fit slower than another."""
+        return self._run("budgeted_again", "the second run with a budget", budget=self.budget)
+
+    def _run(
+        self, name: str, what: str, checkpoints: Sequence[float] | None = None, budget: Budget | None = None
+    ) -> OrdinaryRun:
         _ = self.before
         out, start = self.bench.folder(name) / "submission", time.monotonic()
-        run = OrdinaryRun("refused", "", 0.0, 0.0, out / "model")
+        run = OrdinaryRun("refused", "", 0.0, out / "model")
         try:
             with self.bench.process(what):
                 submission = run_method(
@@ -143,6 +179,7 @@ class Evidence:
                     timeout_seconds=self.timeout_seconds,
                     timing_frames=0,
                     checkpoints=checkpoints,
+                    budget=budget,
                 )
         except DiskFullError:
             raise
@@ -155,9 +192,8 @@ class Evidence:
             run,
             status=status,
             reason=reason,
-            fit_seconds=submission.record.fit_seconds or 0.0,
             seconds=time.monotonic() - start,
-            checkpoints=submission.record.checkpoints,
+            record=submission.record,
         )
 
     def good_run(self) -> OrdinaryRun | None:

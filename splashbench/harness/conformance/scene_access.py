@@ -47,17 +47,18 @@ def checkpoints(evidence: Evidence) -> Judgement:
     run = evidence.checkpointed
     if not run.ok:
         return Verdict.FAILED, f"{run.status}: {run.reason}"
-    if not run.checkpoints:
+    taken = run.record.checkpoints if run.record else []
+    if not taken:
         return Verdict.OK, "none was offered: its end alone stands in charts of quality over time"
-    bad = [f"after {c.seconds:.1f} s: {c.status.value}: {c.reason}" for c in run.checkpoints if c.status != Status.OK]
+    bad = [f"after {c.seconds:.1f} s: {c.status.value}: {c.reason}" for c in taken if c.status != Status.OK]
     if bad:
         return Verdict.FAILED, bad[0]
     plain = complete(evidence.reloaded, "loading")
-    taken = complete(evidence.reloaded_checkpointed, "loading")
-    faults = differences(plain.digests, taken.digests, "where states were taken on the way")
+    watched = complete(evidence.reloaded_checkpointed, "loading")
+    faults = differences(plain.digests, watched.digests, "where states were taken on the way")
     if faults and same_seed.judgement(evidence)[0] != Verdict.OK:
         raise NotTested("two fits with one seed differ, so nothing can be told from a third")
-    return judge(faults, f"{len(run.checkpoints)} states")
+    return judge(faults, f"{len(taken)} states")
 
 
 @check("another seed is accepted", "take any seed of 0 or more")

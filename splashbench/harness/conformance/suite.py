@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splashbench.errors import SplashbenchError
-from splashbench.harness.conformance import model, scene_access, stopping
+from splashbench.harness.conformance import costs, model, scene_access, stopping
 from splashbench.harness.conformance.evidence import Evidence
 from splashbench.harness.conformance.report import Check, Finding, Report
 
@@ -19,6 +19,8 @@ TIMEOUT_SECONDS = 600.0
 # What follows the first run, counted in fits (those stopped half way and those of small scenes are parts of one) and
 # in starts of processes (what a run spends besides its fit).
 _FITS, _STARTS = 5.0, 10.0
+# And those of a run with a budget, where the method takes any.
+_BUDGETED_FITS, _BUDGETED_STARTS = 1.0, 1.0
 #: From here on it is worth telling how long it will take.
 _LONG_SECONDS = 30.0
 CHECKS: tuple[Check, ...] = (
@@ -27,6 +29,7 @@ CHECKS: tuple[Check, ...] = (
     *(
         scene_access.same_seed,
         scene_access.checkpoints,
+        costs.budgets,
         scene_access.other_seed,
         scene_access.hidden_test_views,
         scene_access.unread_test_views,
@@ -80,7 +83,9 @@ def conform(
             run = evidence.good_run()
             if run is not None and report.fit_seconds is None:
                 report.fit_seconds = run.fit_seconds
-                rest = _FITS * run.fit_seconds + _STARTS * (run.seconds - run.fit_seconds)
+                budgeted = bool(evidence.method.budgets)
+                fits, starts = _FITS + budgeted * _BUDGETED_FITS, _STARTS + budgeted * _BUDGETED_STARTS
+                rest = fits * run.fit_seconds + starts * (run.seconds - run.fit_seconds)
                 if estimate and only is None and rest > _LONG_SECONDS:
                     estimate(run.fit_seconds, rest)
     report.seconds = time.monotonic() - start

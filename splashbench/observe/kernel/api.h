@@ -18,7 +18,7 @@ typedef struct SplashCarving {
     float* phi;                 // [nx, ny, nz] voxels
     float* second;              // likewise; null: the second largest values are not wanted
     int32_t block;              // nodes along the edge of a block
-    const uint8_t* blocks;      // one for each block of the grid: 0, or its nodes are looked at; null: all are
+    const uint8_t* blocks;      // one for each block of the grid: 1 where its nodes are looked at; null: all are
     double origin[3], voxel;    // of node (0, 0, 0); between neighbours
     double projection[3][4];    // scene to pixels
     double focal;               // one pixel at depth z spans z / focal
@@ -28,11 +28,13 @@ typedef struct SplashCarving {
     const double* starts;       // [K] depths from which the layers after the first count, rising
     const float* layers;        // [K + 1, height, width] pixels
     const float* nearest;       // [height, width], depth of the occluder; null where K is 0
-    double tolerance;           // how much deeper than the occluder is hidden
+    double tolerance;           // what is farther behind the occluder than this is hidden
     float limit;                // voxels
 } SplashCarving;
 
-// phi = max(phi, distance of each node to the view's silhouette cone), in place.
+// phi = max(phi, distance of each node to the view's silhouette cone), in place; nodes behind the camera are `limit` outside.
+// With `second` phi has the largest and `second` the second largest of all views so far, and nodes behind the camera count
+// as -limit, which says nothing.
 SPLASH_API void splash_carve(const SplashCarving*, int32_t threads);
 
 #ifdef __cplusplus

@@ -1,7 +1,8 @@
 // The distance of a grid's nodes to one view's silhouette cone (paper, "Observed geometry"; hull.py has the formula).
 //
 // Nodes are worked on in runs along z, quantity after quantity, so that everything but the look into the image becomes
-// vector instructions. Where a node is seen is told in double precision: a pixel off is another layer.
+// vector instructions. Projection and depths are in double precision, as a pixel off may be another layer; what is read
+// from the image is in single precision.
 
 #include "carve.h"
 
@@ -19,7 +20,7 @@ constexpr int RUN = 64;
 // In a line of the processor's cache.
 constexpr int FLOATS_PER_LINE = 16;
 static_assert(RUN % LANES == 0, "whole vectors");
-// Voxels before the camera's plane that are in it, by rounding. What is there or behind it has no pixel.
+// So many voxels in front of the camera's plane still count as in it, for rounding. What is in it or behind it has no pixel.
 constexpr double IN_PLANE = 1e-9;
 
 // What is not a number becomes 0: no place is outside the image, whatever the projection.
@@ -54,7 +55,8 @@ class View {
     void carve(int64_t i, int64_t j, int first, int count, Run& run) const {
         const int64_t at = (i * carving_.shape[1] + j) * carving_.shape[2] + first;
         for (int n = 0; n < count; n += FLOATS_PER_LINE) prefetch(carving_.phi + at + n);
-        // Whole vectors: the same node has the same bits wherever its run begins. Nodes too many are not written.
+        // Whole vectors, so that a node has the same bits wherever its run begins (a test holds compilers to it). What is
+        // computed beyond `count` is not written.
         const int whole = (count + LANES - 1) / LANES * LANES;
         locate(i, j, first, whole, run);
         if (carving_.starts_count > 0) choose_layers(whole, run);

@@ -427,3 +427,61 @@ class Mute(Sky):
 
     def supports(self, scene: TrainingScene) -> Support:
         return Support(False)
+
+
+# --- budgets
+
+
+class Padded(Model):
+    """Stores bytes that nobody needs."""
+
+    padding = 50_000
+
+    def save(self, directory: Path) -> None:
+        super().save(directory)
+        (directory / "padding").write_bytes(bytes(self.padding))
+
+
+class Spendthrift(Sky):
+    """Says that it keeps to bytes, and does not."""
+
+    Model = Padded
+    budgets = ("storage_bytes",)
+
+
+class Thrifty(Sky):
+    """Takes a second, and 50 kB; fewer where it is asked to."""
+
+    Model = Padded
+    budgets = ("seconds", "storage_bytes", "memory_bytes")
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Model:
+        fitted = super().fit(scene, config, run)
+        clock.sleep(min(1.0, 0.5 * (run.budget.seconds or 2)))
+        fitted.padding = 1000 if run.budget.storage_bytes else Padded.padding
+        return fitted
+
+
+class Late(Sky):
+    """Says that it keeps to seconds, and does not."""
+
+    budgets = ("seconds",)
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Model:
+        clock.sleep(1.0)
+        return super().fit(scene, config, run)
+
+
+class Misspelt(Sky):
+    budgets = ("storage",)
+
+
+class GivesUp(Sky):
+    """Keeps to its budget by having nothing to show."""
+
+    budgets = ("storage_bytes",)
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Model:
+        if run.budget.limits:
+            raise SplashbenchError("so few bytes are no model; give more")
+        return super().fit(scene, config, run)

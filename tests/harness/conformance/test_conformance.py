@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.harness.conformance import Report, Verdict, conform
+from splashbench.harness.conformance import Report, Verdict, conform, evidence
 
 METHODS = Path(__file__).with_name("methods_for_conformance.py")
 RENDERING = ["files", "load", "again", "views", "between", "size", "principal_point"]
@@ -28,7 +28,7 @@ def test_a_sound_method_passes_every_check() -> None:
     assert {finding.name: finding.detail for finding in report.findings if finding.verdict != Verdict.OK} == {}
     assert report.passed
     assert heard == [finding.name for finding in report.findings]
-    assert len(heard) == 24
+    assert len(heard) == 25
     assert report.preset == "quick"
     assert report.fit_seconds is not None
 
@@ -135,6 +135,29 @@ def test_states_on_the_way_are_taken() -> None:
 )
 def test_states_on_the_way_that_are_wrong_or_change_the_fit(name: str, said: str) -> None:
     assert said in verdicts(tried(name, ["checkpoints"]), Verdict.FAILED)["checkpoints"]
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "said"),
+    [
+        ("Sky", Verdict.OK, r"^it takes none$"),
+        ("Thrifty", Verdict.OK, r"^0\.\d of 0\.\d s, 0\.00\d of 0\.03\d MB; not tried: memory_bytes$"),
+        ("Spendthrift", Verdict.FAILED, r"^a budget of 0\.03\d+ MB of storage could not be kept: 0\.05"),
+        ("Late", Verdict.FAILED, r"^a budget of 0\.\d+ s could not be kept: 1"),
+        ("Misspelt", Verdict.FAILED, "^budgets names 'storage'; there are seconds, storage_bytes, memory_bytes$"),
+        ("GivesUp", Verdict.FAILED, "^crashed: so few bytes are no model; give more$"),
+    ],
+)
+def test_budgets_that_a_method_says_it_keeps_to(
+    name: str, verdict: Verdict, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evidence, "_LEAST_SECONDS", 0.2)
+    assert re.search(said, verdicts(tried(name, ["budgets"]), verdict)["budgets"])
+
+
+def test_seconds_are_not_asked_of_a_fit_that_is_short_already() -> None:
+    report = tried("Late", ["budgets"])
+    assert verdicts(report, Verdict.OK) == {"budgets": "not tried: seconds"}
 
 
 def test_a_seed_that_is_refused() -> None:

@@ -182,9 +182,9 @@ def test_least_takes_no_more_than_the_share() -> None:
     assert least(torch.zeros(0), 0.5).tolist() == []
 
 
-def _visible_after(idle_share: float, iterations: int, seen: int = 4) -> list[bool]:
+def _visible_after(idle_share: float, iterations: int, early: bool = False) -> list[bool]:
     """Which carriers are fitted to the end: 2 and 3 lie behind others, all opaque."""
-    settings = FitSettings(iterations=iterations, idle_share=idle_share, idle_seen=seen, base_scale=2.0)
+    settings = FitSettings(iterations=iterations, idle_share=idle_share, idle_early=early, base_scale=2.0)
     heads = DecoderSettings(feature_size=4, children=1, opacity_bias=6.0)
     appearance = initial_appearance(4, 1.0, settings, heads, seed=0)
     track = _track()
@@ -197,7 +197,7 @@ def test_carriers_idle_in_all_photographs_are_left_out_once_all_were_seen() -> N
     assert all(_visible_after(0.0, 40))
     assert _visible_after(0.1, 40) == [True, True, False, False]
     assert all(_visible_after(0.1, 9))  # the photographs were not seen four times by the last look
-    assert not all(_visible_after(0.1, 9, seen=1))
+    assert not all(_visible_after(0.1, 9, early=True))
 
 
 def test_liquid_beside_the_masks_is_not_idle_where_it_is_drawn_together_with_the_background() -> None:

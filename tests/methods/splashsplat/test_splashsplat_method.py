@@ -289,7 +289,6 @@ def test_the_paper_preset_is_the_papers():
     assert tuple(vars(weights).values()) == (0.5, 0.1, 0.2, 0.7, 0.01, 0.1, 1.0, 0.0)  # the last is not the paper's
     velocity = paper.motion.velocity
     assert (velocity.steps, velocity.step_size, velocity.band, velocity.limit) == (35, 0.45, 4.0, 8.0)
-    assert velocity.tolerance == 0
     assert (velocity.smooth, velocity.smoothing, velocity.smoothing_unit) == ("field", 0.6, "transport")
     shell = paper.carriers.shell
     assert (shell.min_per_cell, shell.max_per_cell, shell.depth, shell.outside) == (2, 5, 3.0, 0.0)
@@ -302,5 +301,9 @@ def test_the_paper_preset_is_the_papers():
     best = SplashSplatConfig()
     assert (best.carriers.shell.depth, best.in_transparent_container().carriers.shell.depth) == (12.0, 6.0)
     assert paper.in_transparent_container() == paper
+    early = [
+        c.optimisation.idle_early for c in (best, best.in_transparent_container(), paper.in_transparent_container())
+    ]
+    assert early == [False, True, False]
     assert (best.base_scale, best.decoder.offset_bound, best.decoder.opacity_band) == (0.5, 3.0, 20.0)
     assert (paper.fields.detect_failed_masks, paper.fields.replace_empty_masks) == (False, False)

@@ -126,27 +126,6 @@ def test_a_fit_that_carries_on_needs_fewer_steps():
     np.testing.assert_array_equal(fit_velocity(places[0], places[1], FACTOR).control, first)
 
 
-def test_a_fit_ends_once_a_step_gains_little_and_takes_back_one_that_loses():
-    """Residuals of each step as the full fit has them tell where the one with a tolerance ends."""
-    places = [ball((x, 20, 20)) for x in (14.0, 17.0)]
-
-    def residual(steps: int) -> float:
-        return fit_velocity(*places, FACTOR, VelocitySettings(steps=steps)).residual
-
-    tolerance, most = 0.05, 35
-    residuals = [residual(steps) for steps in range(most + 1)]
-    gains = 1 - np.array(residuals[1:]) / np.array(residuals[:-1])
-    last = int(np.argmax(gains < tolerance))
-    assert 2 < last < most - 5
-    ended = fit_velocity(*places, FACTOR, VelocitySettings(steps=most, tolerance=tolerance))
-    assert ended.residual == pytest.approx(residuals[last + (gains[last] >= 0)], rel=1e-6)
-    assert ended.residual_before == residuals[0]
-    # A motion that is right to begin with: every step throws it off, and none is kept.
-    right = fit_velocity(*places, FACTOR, VelocitySettings(steps=most)).control
-    wrong_step = VelocitySettings(steps=most, tolerance=tolerance, step_size=5.0)
-    np.testing.assert_array_equal(fit_velocity(*places, FACTOR, wrong_step, right).control, right)
-
-
 def test_velocity_never_exceeds_its_limit():
     fit = fit_velocity(ball((15, 20, 20)), ball((22, 20, 20)), FACTOR, VelocitySettings(limit=2.0))
     assert np.linalg.norm(fit.control, axis=-1).max() <= 2.0 + 1e-5
