@@ -47,5 +47,5 @@ def test_only_rows_of_earlier_versions_are_named_as_such() -> None:
 
 
 def test_the_rows_of_masks_alone_are_told_by_their_digest() -> None:
-    (digest,) = re.findall(r"`settings_digest` (\w+)", README.read_text(encoding="utf-8"))
+    (digest,) = re.findall(r"`settings_digest` ([0-9a-f]{8})", README.read_text(encoding="utf-8"))
     assert digest in {digest for method, _, _, digest in rows() if method == "splashsplat"}
