@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -64,12 +67,16 @@ def nodes_of(blocks: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     return wanted[: shape[0], : shape[1], : shape[2]]
 
 
-@pytest.fixture(params=KERNEL.built_variants())
+#: Where the kernels are that are to be tested: those of `make sanitize` lie elsewhere.
+FOLDER = Path(os.environ.get("SPLASHBENCH_KERNEL") or KERNEL.folder)
+
+
+@pytest.fixture(params=[name for name in KERNEL.built_variants(FOLDER) if name.isalnum()])
 def variant(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """The kernel of one variant after the other."""
     if not KERNEL.runs(request.param):
         pytest.skip(f"this processor does not run {request.param}")
-    monkeypatch.setitem(KERNEL.__dict__, "library", KERNEL.open_variant(request.param))
+    monkeypatch.setitem(KERNEL.__dict__, "library", KERNEL.open_variant(request.param, FOLDER))
     return str(request.param)
 
 
