@@ -274,7 +274,8 @@ class SplashSplat(Method):
             def room() -> int:
                 return limit - background.stored_bytes
 
-        found = fit_liquid(scene, behind, traced, run, (_BEFORE, 1), frozen, offer, settled, room)
+        watched = offer if run.watched else None
+        found = fit_liquid(scene, behind, traced, run, (_BEFORE, 1), frozen, watched, settled, room)
         if settled is not None:
             background = late()  # a fit without any photograph asked for none
         return FittedSplashSplat(*with_background(*found))

@@ -141,8 +141,8 @@ def fit_liquid(
         return reconstruction(appearance, shown(appearance, left))
 
     def offer_state(state: Callable[[], tuple[Appearance, np.ndarray]], milestone: bool) -> None:
-        if offer is not None:
-            offer(lambda: as_it_is(*state()), milestone)
+        assert offer is not None
+        offer(lambda: as_it_is(*state()), milestone)
 
     with run.stage("appearance"), one_torch_thread():
         appearance, fit = _fit_appearance(
@@ -155,7 +155,7 @@ def fit_liquid(
             config,
             run.seed,
             lambda done: run.progress(span[0] + (span[1] - span[0]) * done, "appearance"),
-            offer_state,
+            None if offer is None else offer_state,
             settled,
             _clock(run),
         )
@@ -280,7 +280,7 @@ def _fit_appearance(
     config: SplashSplatConfig,
     seed: int,
     progress: Callable[[float], None],
-    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None],
+    offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None,
     settled: Callable[[], dict[str, np.ndarray]] | None,
     clock: Clock | None,
 ) -> tuple[Appearance, Fit | None]:

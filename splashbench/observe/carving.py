@@ -129,6 +129,9 @@ def carve_hidden_view(
     starts = np.ascontiguousarray(starts, np.float64)
     origin, projection, corner = (np.asarray(place, np.float64) for place in (origin, projection, corner))
     blocks = None if blocks is None else np.ascontiguousarray(blocks, np.bool_)
+    for name, value in (("voxel", voxel), ("focal", focal), ("limit", limit)):
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} is {value}, not a positive number")
     for name, field in (("phi", phi), ("second", second)):
         if field is not None and (field.dtype != np.float32 or not field.flags.c_contiguous):
             raise TypeError(f"{name} is not contiguous float32")

@@ -195,6 +195,10 @@ def read_only() -> np.ndarray:
         ({"origin": np.zeros(2)}, ValueError, "origin"),
         ({"corner": np.zeros(3)}, ValueError, "corner"),
         ({"blocks": np.ones((2, 1, 1), bool)}, ValueError, "blocks"),
+        ({"voxel": 0.0}, ValueError, "voxel"),
+        ({"voxel": np.nan}, ValueError, "voxel"),
+        ({"focal": -9.0}, ValueError, "focal"),
+        ({"limit": np.inf}, ValueError, "limit"),
     ],
 )
 def test_what_does_not_fit_together_is_named(change: dict, error: type[Exception], named: str) -> None:

@@ -6,7 +6,7 @@ from splashbench.harness.conformance.evidence import Evidence, OrdinaryRun
 from splashbench.harness.conformance.report import Judgement, NotTested, Verdict, check, judge
 from splashbench.submission import Budget
 
-#: Told apart by name: a method's `budgets` may have no others.
+#: What a method's `budgets` may name.
 _LIMITS = tuple(Budget.model_fields)
 
 
@@ -28,24 +28,27 @@ def budgets(evidence: Evidence) -> Judgement:
     told = f"not tried: {', '.join(untried)}" if untried else ""
     if not limits:
         return Verdict.OK, told
-    run = evidence.budgeted
-    if _faults(run, evidence.budget):
-        run = evidence.budgeted_again
-    return judge(_faults(run, evidence.budget), "; ".join(filter(None, [_used(run, evidence.budget), told])))
+    faults, used = _judged(evidence.budgeted, evidence.budget)
+    if faults:
+        faults, used = _judged(evidence.budgeted_again, evidence.budget)
+    return judge(faults, "; ".join([*used, *([told] if told else [])]))
 
 
-def _faults(run: OrdinaryRun, budget: Budget) -> list[str]:
+def _judged(run: OrdinaryRun, budget: Budget) -> tuple[list[str], list[str]]:
+    """A line for each fault of `run`, and what of `budget` it used, in words."""
     if run.record is None or not run.ok:
-        return [f"{run.status}: {run.reason}"]
-    return budget.exceeded(run.record.fit_seconds, run.record.storage_bytes, run.record.peak_memory_bytes)
-
-
-def _used(run: OrdinaryRun, budget: Budget) -> str:
-    """What of `budget` was used, in words."""
-    assert run.record is not None
-    used = []
-    if budget.seconds is not None:
-        used.append(f"{run.fit_seconds:.1f} of {budget.seconds:.1f} s")
-    if budget.storage_bytes is not None:
-        used.append(f"{(run.record.storage_bytes or 0) / 1e6:.3f} of {budget.storage_bytes / 1e6:.3f} MB")
-    return ", ".join(used)
+        return [f"{run.status}: {run.reason}"], []
+    seconds, storage = run.record.fit_seconds, run.record.storage_bytes
+    faults, used = budget.exceeded(seconds, storage, None), []
+    for limit, found, unit, form in (
+        (budget.seconds, seconds, "s", ".1f"),
+        (budget.storage_bytes, storage, "MB", ".3f"),
+    ):
+        if limit is None:
+            continue
+        if found is None:
+            faults.append(f"the run with a budget has no figure in {unit}")
+            continue
+        scale = 1e6 if unit == "MB" else 1.0
+        used.append(f"{found / scale:{form}} of {limit / scale:{form}} {unit}")
+    return faults, used

@@ -141,7 +141,7 @@ def test_states_on_the_way_that_are_wrong_or_change_the_fit(name: str, said: str
     ("name", "verdict", "said"),
     [
         ("Sky", Verdict.OK, r"^it takes none$"),
-        ("Thrifty", Verdict.OK, r"^0\.\d of 0\.\d s, 0\.00\d of 0\.03\d MB; not tried: memory_bytes$"),
+        ("Thrifty", Verdict.OK, r"^\d\.\d of \d\.\d s; 0\.00\d of 0\.03\d MB; not tried: memory_bytes$"),
         ("Spendthrift", Verdict.FAILED, r"^a budget of 0\.03\d+ MB of storage could not be kept: 0\.05"),
         ("Late", Verdict.FAILED, r"^a budget of 0\.\d+ s could not be kept: 1"),
         ("Misspelt", Verdict.FAILED, "^budgets names 'storage'; there are seconds, storage_bytes, memory_bytes$"),
@@ -153,6 +153,18 @@ def test_budgets_that_a_method_says_it_keeps_to(
 ) -> None:
     monkeypatch.setattr(evidence, "_LEAST_SECONDS", 0.2)
     assert re.search(said, verdicts(tried(name, ["budgets"]), verdict)["budgets"])
+
+
+def test_a_run_with_a_budget_that_is_refused_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    run_method = evidence.run_method
+
+    def refusing(*arguments, budget=None, **options):
+        if budget is not None:
+            raise SplashbenchError("no such budget")
+        return run_method(*arguments, **options)
+
+    monkeypatch.setattr(evidence, "run_method", refusing)
+    assert verdicts(tried("Spendthrift", ["budgets"]), Verdict.FAILED) == {"budgets": "refused: no such budget"}
 
 
 def test_seconds_are_not_asked_of_a_fit_that_is_short_already() -> None:
