@@ -30,7 +30,7 @@ from splashbench.progress import track
 from splashbench.scene import Camera, Scene, TrainingScene
 from splashbench.score.protocol import require_complete
 from splashbench.submission import IDENTITY, Submission, seal, to_8bit, write_view
-from splashbench_methods.splashsplat.appearance.fitting import composite
+from splashbench_methods.splashsplat.appearance.compositing import composite
 from splashbench_methods.splashsplat.method import FittedSplashSplat, SplashSplat
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
+from splashbench.gaussians.devices import CPU, GaussianMethod
 from splashbench.gaussians.torch_threads import one_torch_thread
-from splashbench.harness.contract import Fitted, Method, Render, Run, Support
+from splashbench.harness.contract import Fitted, Render, Run, Support
 from splashbench.render import Frozen, freeze
 from splashbench.scene.camera import Camera
 from splashbench.scene.gaussians import Gaussians
@@ -23,8 +24,8 @@ from splashbench.scene.velocity import VelocityField
 from splashbench.selfcalibration import self_calibration
 
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
+from .appearance.compositing import composite
 from .appearance.decoder import Children
-from .appearance.fitting import composite
 from .carriers.between import carriers_at
 from .carriers.subframe import CarrierState
 from .draft import make_draft
@@ -51,8 +52,14 @@ class FittedSplashSplat(Fitted):
         self.liquid = liquid
         self.background = background
         self.occlusion = occlusion
+        self._device, self._look = CPU, liquid.appearance
         self._background_image: tuple[Camera, np.ndarray] | None = None
         self._frozen: tuple[Camera, Frozen] | None = None
+
+    def to_device(self, device: str) -> None:
+        """Decode and draw on `device` from now on; where carriers are, and what lies behind them, is the processor's
+        to find."""
+        self._device, self._look = device, self.liquid.appearance.to(device)
 
     def _background(self, camera: Camera) -> np.ndarray:
         # Videos ask for one camera many times in a row, and nothing in the background moves.
@@ -74,7 +81,7 @@ class FittedSplashSplat(Fitted):
         Those that the container's near wall cuts are whole here.
         """
         shown = self._shown(camera, time)
-        return None if shown is None else shown[0]
+        return None if shown is None else shown[0].to(CPU)
 
     @torch.no_grad()
     def _shown(self, camera: Camera, time: float) -> tuple[Children, tuple[torch.Tensor, torch.Tensor] | None] | None:
@@ -85,7 +92,9 @@ class FittedSplashSplat(Fitted):
         children = self._decoded(parts, camera.center)
         places = np.concatenate([state.positions.numpy().astype(np.float64) for _, state in parts])
         cut = None if self.occlusion is None else self.occlusion.cut(camera, places)
-        return children, None if cut is None else (torch.from_numpy(cut[0]), torch.from_numpy(cut[1]))
+        if cut is None:
+            return children, None
+        return children, (torch.from_numpy(cut[0]).to(self._device), torch.from_numpy(cut[1]).to(self._device))
 
     def _carriers(self, time: float) -> list[tuple[torch.Tensor, CarrierState]]:
         liquid = self.liquid
@@ -100,13 +109,19 @@ class FittedSplashSplat(Fitted):
         return replace(state, visibility=seen if state.visibility is None else seen * state.visibility)
 
     def _decoded(self, carriers: list[tuple[torch.Tensor, CarrierState]], eye: np.ndarray) -> Children:
-        look = self.liquid.appearance
-        place = torch.tensor(eye, dtype=torch.float32)
+        look = self._look
+        place = self._eye(eye)
         with one_torch_thread():
             parts = [
-                look.decoder.decode(look.features, look.log_scales, ids, state, place)[0] for ids, state in carriers
+                look.decoder.decode(
+                    look.features, look.log_scales, ids.to(self._device), state.to(self._device), place
+                )[0]
+                for ids, state in carriers
             ]
         return Children(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Children)))
+
+    def _eye(self, place: np.ndarray) -> torch.Tensor:
+        return torch.tensor(place, dtype=torch.float32, device=self._device)
 
     @torch.no_grad()
     def render(self, camera: Camera, time: float) -> Render:
@@ -118,15 +133,15 @@ class FittedSplashSplat(Fitted):
         children, cut = shown
         with one_torch_thread():
             if self.liquid.composition == "together":
-                far = torch.from_numpy(self.background.far_color)
+                far = torch.from_numpy(self.background.far_color).to(self._device)
                 rgb, alpha = composite(children, camera, far, self._frozen_background(camera))
             else:
-                behind = torch.from_numpy(self._background(camera))
+                behind = torch.from_numpy(self._background(camera)).to(self._device)
                 wall, in_front = cut or (None, None)
-                glass = self.liquid.appearance.glass
-                before = None if glass is None else glass.seen(torch.tensor(camera.center, dtype=torch.float32))
+                glass = self._look.glass
+                before = None if glass is None else glass.seen(self._eye(camera.center))
                 rgb, alpha = composite(children, camera, behind, wall=wall, in_front=in_front, glass=before)
-            return Render(rgb.clamp(0, 1).numpy(), alpha.clamp(0, 1).numpy())
+            return Render(rgb.clamp(0, 1).cpu().numpy(), alpha.clamp(0, 1).cpu().numpy())
 
     def particles(self) -> Particles:
         """The carriers."""
@@ -146,7 +161,7 @@ class FittedSplashSplat(Fitted):
         carriers = self._carriers(time)
         if not carriers:
             return Gaussians.none()
-        children = self._decoded(carriers, eye)
+        children = self._decoded(carriers, eye).to(CPU)
         parts = (children.means, children.factors, children.opacities, children.colors)
         return Gaussians(*(part.flatten(0, 1).numpy() for part in parts))
 
@@ -172,7 +187,7 @@ class FittedSplashSplat(Fitted):
             self.occlusion.save(static)
 
 
-class SplashSplat(Method):
+class SplashSplat(GaussianMethod):
     """Carriers moved by a fitted velocity field, corrected and refilled by the hull, decoded into Gaussians."""
 
     id: ClassVar[str] = "splashsplat"
@@ -213,6 +228,7 @@ class SplashSplat(Method):
                     scene,
                     config,
                     run.seed,
+                    run.device,
                     known,
                     plates,
                     lambda state, milestone: run.checkpoint(lambda: FittedSplashSplat(*state()), milestone),

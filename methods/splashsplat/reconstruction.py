@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splashbench.files import compressed_bytes
+from splashbench.gaussians.devices import CPU
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.native import memory
@@ -158,6 +159,7 @@ def fit_liquid(
             None if offer is None else offer_state,
             settled,
             _clock(run),
+            run.device,
         )
     if fit is not None and fit.earned:
         run.decide(iterations_decision(fit.earned, len(fit.losses)))
@@ -283,6 +285,7 @@ def _fit_appearance(
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None,
     settled: Callable[[], dict[str, np.ndarray]] | None,
     clock: Clock | None,
+    device: str,
 ) -> tuple[Appearance, Fit | None]:
     """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; None where there
     are none."""
@@ -318,17 +321,20 @@ def _fit_appearance(
         return appearance, None
     if config.first_look:
         take_on(photographed(track, targets), appearance.features, appearance.decoder)
+    if device != CPU:
+        set_backgrounds(targets, backgrounds, device)
+        set_smaller_backgrounds(targets, backgrounds, device)
     color_cell = observations.hull_grid.voxel / voxel
 
     def settle() -> None:
         if settled is not None:
             behind = settled()
-            set_backgrounds(targets, behind)
-            set_smaller_backgrounds(targets, behind)
+            set_backgrounds(targets, behind, device)
+            set_smaller_backgrounds(targets, behind, device)
             backgrounds.clear()  # nobody needs those of before, which are large
 
     fit = fit_appearance(
-        appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle, clock
+        appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle, clock, device
     )
     return appearance, fit
 

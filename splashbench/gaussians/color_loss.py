@@ -65,7 +65,7 @@ def l1(image: torch.Tensor, target: NDArray[np.uint8], seen: NDArray[np.bool_]) 
     """
     if image.shape != target.shape or target.shape[:2] != seen.shape:
         raise ValueError(f"an image of {tuple(image.shape)} does not compare with {target.shape} and {seen.shape}")
-    return _l1_by_torch(image, target, seen) if image.is_cuda else _L1.apply(image, target, seen)
+    return _l1_by_torch(image, target, seen) if image.device.type != "cpu" else _L1.apply(image, target, seen)
 
 
 def _l1_by_torch(image: torch.Tensor, target: NDArray[np.uint8], seen: NDArray[np.bool_]) -> torch.Tensor:

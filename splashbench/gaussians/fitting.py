@@ -118,7 +118,7 @@ def fit_dynamic(
 
 def _loss_and_error(image: Tensor, photograph: NDArray[np.uint8]) -> tuple[Tensor, Tensor | float]:
     """The loss of `image` [H, W, 3] against a photograph of that size, and the mean squared error."""
-    if image.is_cuda:
+    if image.device.type != "cpu":
         return _on_device(image, photograph)
     truth = photograph * np.float32(1 / 255)
     loss = (1 - _SSIM_WEIGHT) * l1(image, photograph, np.ones(photograph.shape[:2], bool))

@@ -34,7 +34,7 @@ def screen_gradients(camera: Camera, means: NDArray, gradients: NDArray) -> NDAr
 
 def screen_gradients_of(camera: Camera, means: Tensor, gradients: Tensor) -> Tensor:
     """`screen_gradients` of tensors [N, 3] without gradients of their own, on the device where they lie."""
-    if not means.is_cuda:
+    if means.device.type == "cpu":
         return torch.from_numpy(screen_gradients(camera, means.numpy(), gradients.numpy()))
     return _screen_gradients_by_torch(camera, means, gradients)
 

@@ -214,7 +214,8 @@ class _Ssim(torch.autograd.Function):
 
 def ssim(image: Tensor, target: SsimTarget) -> Tensor:
     """SSIM of a float32 image [h, w, channels] in [0, 1] to `target`, differentiable by the image."""
-    return ssim_by_torch(image, *target.on(image.device)) if image.is_cuda else _Ssim.apply(image, target)
+    elsewhere = image.device.type != "cpu"
+    return ssim_by_torch(image, *target.on(image.device)) if elsewhere else _Ssim.apply(image, target)
 
 
 def ssim_by_torch(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from splashbench.score import score_submission
 pytestmark = pytest.mark.cuda
 
 #: Small fits that grow, prune, split and, where a method has it, sample by its guide.
-SMALL = {
+SMALL: dict[str, dict[str, Any]] = {
+    "splashsplat": {"hull_cells": 48, "transport_cells": 24, "control_cells": 8, "iterations": 200},
     "spacetime_gaussians": {"iterations": 200, "static_points": 300, "hull_points": 400, "max_gaussians": 1500},
     "spacetime_gaussians_lite": {"iterations": 200, "static_points": 300, "hull_points": 400, "max_gaussians": 1500},
     "deformable_3dgs": {"iterations": 200, "static_points": 300, "hull_points": 400, "max_gaussians": 1500},

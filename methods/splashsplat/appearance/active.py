@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.gaussians.devices import CPU
+
 from ..carriers.subframe import CarrierState, Track
 from .cells import cell_numbers
 from .decoder import ColorCells
@@ -31,6 +33,18 @@ class Active:
     state: CarrierState
     cells: ColorCells
     in_front: Tensor | None = None
+
+    def to(self, device: str) -> Active:
+        """The same on `device`."""
+        if device == CPU:
+            return self
+        return Active(
+            self.ids.to(device),
+            None if self.places is None else self.places.to(device),
+            self.state.to(device),
+            ColorCells(self.cells.of_carriers.to(device), self.cells.sizes.to(device)),
+            None if self.in_front is None else self.in_front.to(device),
+        )
 
 
 class ActiveCarriers:
@@ -54,20 +68,20 @@ class ActiveCarriers:
         """What `target` teaches."""
         t = target.frame
         left = self._left[t]
-        # Made anew each time: states of all frames would hold hundreds of megabytes on large scenes.
-        state = _part(self._track.state(t, target.fraction), left)
-        places, visibility = None, None
+        places, visibility, taught = None, None, left
         shown = self._shown(target)
         if shown is not None:
             places = chosen(shown, left).nonzero()[:, 0]
+            taught = places if left is None else left.index_select(0, places)
         if target.hidden is not None:
-            hidden = chosen(chosen(target.hidden, left), places)
-            visibility = 1 - hidden.to(torch.float32) / HIDDEN
-        state = replace(_part(state, places), visibility=visibility)
+            visibility = 1 - chosen(target.hidden, taught).to(torch.float32) / HIDDEN
+        # Made anew each time: states of all frames would hold hundreds of megabytes on large scenes.
+        state = self._track.state(t, target.fraction, None if taught is None else taught.numpy())
+        state = replace(state, visibility=visibility)
         numbers = chosen(self._cells[t], places)
         # Cells of which none is left count one, as nothing may be divided by zero.
         sizes = torch.bincount(numbers).clamp_min(1).to(torch.float32)
-        in_front = None if target.in_front is None else chosen(chosen(target.in_front, left), places)
+        in_front = None if target.in_front is None else chosen(target.in_front, taught)
         return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes), in_front)
 
     def _shown(self, target: TrainingTarget) -> Tensor | None:
@@ -121,11 +135,3 @@ def _cells(track: Track, t: int, size: float) -> Tensor:
 def chosen(values: Tensor, places: Tensor | None) -> Tensor:
     """The rows of `values` at `places` (int64 [n]); all of them without."""
     return values if places is None else values.index_select(0, places)
-
-
-def _part(state: CarrierState, places: Tensor | None) -> CarrierState:
-    return CarrierState(
-        chosen(state.positions, places),
-        chosen(state.deformation, places),
-        chosen(state.phi, places),
-    )

@@ -51,8 +51,9 @@ class Averages:
     """Running means of the values of `count` carriers, `size` each, and of the weights of `decoder`."""
 
     def __init__(self, count: int, size: int, decoder: Decoder) -> None:
-        self._values = torch.zeros(count, size)
-        self._known = torch.zeros(count, dtype=torch.bool)
+        device = decoder.opacity.weight.device
+        self._values = torch.zeros(count, size, device=device)
+        self._known = torch.zeros(count, dtype=torch.bool, device=device)
         self._decoder = decoder
         self._heads = [parameter.detach().clone() for parameter in decoder.parameters()]
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from splashbench.gaussians.devices import CPU
 from splashbench.parallel import each
 from splashbench.scene.camera import Camera
 
@@ -60,9 +61,12 @@ def _halve(
     each(halve, targets)
 
 
-def set_smaller_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
-    """Put others behind the smaller ones of `targets` where these have some, in place; see `with_smaller`."""
-    behind = {name: torch.from_numpy(image) for name, image in backgrounds.items()}
+def set_smaller_backgrounds(
+    targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray], device: str = CPU
+) -> None:
+    """Put others behind the smaller ones of `targets` where these have some, in place, on `device`; see
+    `with_smaller`."""
+    behind = {name: torch.from_numpy(image).to(device) for name, image in backgrounds.items()}
     for _ in range(HALVINGS):
         targets = [target.coarse for target in targets if target.coarse is not None]
         if not targets:

@@ -29,6 +29,6 @@ def least(weights: Tensor, share: float) -> Tensor:
     """bool [n]: the smallest of `weights` [n], as many as together are at most `share` of all."""
     values, order = weights.to(torch.float64).sort(stable=True)
     sums = values.cumsum(0)
-    chosen = torch.zeros(len(weights), dtype=torch.bool)
+    chosen = torch.zeros(len(weights), dtype=torch.bool, device=weights.device)
     chosen[order[sums <= share * sums[-1:]]] = True
     return chosen

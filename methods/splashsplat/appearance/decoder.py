@@ -55,6 +55,16 @@ class Children:
     colors: Tensor
     offsets: Tensor
 
+    def to(self, device: str) -> Children:
+        """The same on `device`."""
+        return Children(
+            self.means.to(device),
+            self.factors.to(device),
+            self.opacities.to(device),
+            self.colors.to(device),
+            self.offsets.to(device),
+        )
+
 
 @dataclass
 class ColorCells:

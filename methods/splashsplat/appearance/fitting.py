@@ -6,6 +6,7 @@ background and descends on the seven losses. Positions and deformations are give
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -18,18 +19,18 @@ from torch import Tensor
 
 from splashbench.errors import SplashbenchError
 from splashbench.gaussians.adam import Adam
+from splashbench.gaussians.devices import CPU
 from splashbench.native import memory
-from splashbench.render import Frozen, rasterize
-from splashbench.scene.camera import Camera
 
 from ..carriers.subframe import Track
-from ..kernel.window_loss import WindowPhotograph, window_losses
+from ..kernel.window_loss import WindowPhotograph
 from . import losses
 from .active import Active, ActiveCarriers
 from .averages import Averages, ShownHeads
+from .compositing import composite
 from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
-from .glass import Glass, GlassFit, Splats
+from .glass import Glass, GlassFit
 from .optimizer import RowAdam
 from .photographs import ReadAhead, read_now
 from .schedule import (
@@ -121,6 +122,26 @@ class Appearance:
     decoder: Decoder
     glass: Glass | None = None
 
+    def to(self, device: str) -> Appearance:
+        """On `device`: this itself where it is there, else a copy."""
+        if self.features.device.type == torch.device(device).type:
+            return self
+        return Appearance(
+            self.features.to(device),
+            self.log_scales.to(device),
+            copy.deepcopy(self.decoder).to(device),
+            None if self.glass is None else self.glass.to(device),
+        )
+
+    def become(self, other: Appearance) -> None:
+        """Take over all that `other` has learned."""
+        self.features, self.log_scales, self.decoder, self.glass = (
+            other.features,
+            other.log_scales,
+            other.decoder,
+            other.glass,
+        )
+
 
 #: Given the number of a target, features and log-scales of all carriers, and by how much the opacity of each is
 #: multiplied (float32 [count], None for 1): the window as these would show it, and its photograph.
@@ -168,84 +189,6 @@ def initial_appearance(
     return Appearance(features, torch.full((count, 3), initial_log_scale(settings.base_scale, voxel)), heads)
 
 
-def composite(
-    children: Children,
-    camera: Camera,
-    background: Tensor,
-    frozen: Frozen | None = None,
-    modes: np.ndarray | None = None,
-    wall: Tensor | None = None,
-    in_front: Tensor | None = None,
-    glass: Splats | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Liquid and background: rgb [h, w, 3], and the opacity [h, w] of the liquid alone.
-
-    background: [h, w, 3] or [3], behind everything. frozen: the background's Gaussians for this camera, which are drawn
-    in one order of depth with the liquid's (Eq. rendering); without them the liquid lies in front. modes: the tiles
-    in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall,
-    which the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same.
-    glass: Gaussians that are no liquid, drawn in one order of depth with the liquid's.
-    Only one of frozen, wall and glass. The opacity is "obtained by rasterizing G^fg alone" (supplement).
-    """
-    shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
-    colors = children.colors.flatten(0, 1)
-    image: Tensor
-    alpha: Tensor
-    if glass is not None:
-        assert frozen is None
-        assert wall is None
-        image, alpha = _with_glass(shapes, colors, camera, background, glass)
-    elif frozen is None and wall is not None:
-        image, alpha = _behind_wall(shapes, colors, camera, background, wall, in_front)
-    elif frozen is None:
-        image, alpha = rasterize(*shapes, colors, camera, background=background)
-    else:
-        image, _ = rasterize(*shapes, colors, camera, background=background, frozen=frozen, modes=modes)
-        _, alpha = rasterize(*shapes, None, camera)
-    return image, alpha
-
-
-def _with_glass(
-    shapes: tuple[Tensor, Tensor, Tensor], colors: Tensor, camera: Camera, background: Tensor, glass: Splats
-) -> tuple[Tensor, Tensor]:
-    """`composite` where glass stands before the liquid: its share of each pixel is a channel of its own."""
-    theirs = glass.means, glass.factors, glass.opacities
-    means, factors, opacities = (torch.cat(pair) for pair in zip(shapes, theirs))
-    parts = [torch.cat([c, c.new_full((len(c), 1), is_liquid)], 1) for c, is_liquid in ((colors, 1), (glass.colors, 0))]
-    behind = torch.cat([background, background.new_zeros(*background.shape[:-1], 1)], -1)
-    drawn, _ = rasterize(means, factors, opacities, torch.cat(parts), camera, background=behind)
-    return drawn[..., :3], drawn[..., 3]
-
-
-def _behind_wall(
-    shapes: tuple[Tensor, Tensor, Tensor],
-    colors: Tensor,
-    camera: Camera,
-    background: Tensor,
-    wall: Tensor,
-    in_front: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """`composite` where a wall cuts the liquid, except for the carriers `in_front` of it."""
-    if in_front is None or not bool(in_front.any()):
-        image, alpha = rasterize(*shapes, colors, camera, background=background)
-        return image + wall[..., None] * (background - image), alpha * (1 - wall)
-    # Children of one carrier follow each other.
-    drawn_last = in_front.repeat_interleave(len(colors) // len(in_front))
-
-    def part(chosen: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:
-        rows = chosen.nonzero()[:, 0]
-        means, factors, opacities = (values.index_select(0, rows) for values in shapes)
-        drawn: tuple[Tensor, Tensor] = rasterize(
-            means, factors, opacities, colors.index_select(0, rows), camera, background=behind
-        )
-        return drawn
-
-    image, alpha = part(~drawn_last, background)
-    image, alpha = image + wall[..., None] * (background - image), alpha * (1 - wall)
-    over, opacity = part(drawn_last, None)
-    return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
-
-
 def image_loss(
     image: Tensor,
     alpha: Tensor,
@@ -258,7 +201,7 @@ def image_loss(
 
     area: pixels over which the silhouette term averages.
     """
-    foreground, gradient, silhouette = window_losses(image, alpha, photograph)
+    foreground, gradient, silhouette = losses.image_terms(image, alpha, photograph)
     loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / area
     if ssim_weight > 0 or weights.beside > 0:
         truth = photograph.image.to(torch.float32) / 255
@@ -296,26 +239,29 @@ def fit_appearance(
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None = None,
     settle: Callable[[], None] | None = None,
     clock: Clock | None = None,
+    device: str = CPU,
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
 
     offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, but for
     heads that are means over the last steps, and the carriers still fitted: bool [count]; and whether there will be no
     other for a while. settle: is called once, after the share `plates_share`, to put the background behind `targets`.
-    clock: where given, the fit ends when it has run out, and `iterations` are the most that there are.
+    clock: where given, the fit ends when it has run out, and `iterations` are the most that there are. device: where it
+    is fitted; `targets` have their backgrounds there. What is given and handed out lies on the CPU.
 
     Raises SplashbenchError where the loss stops being finite.
     """
-    glass = None if appearance.glass is None else GlassFit(appearance.glass, track.grid.voxel)
+    look = appearance.to(device)
+    glass = None if look.glass is None else GlassFit(look.glass, track.grid.voxel)
     if glass is None:
         settings = replace(settings, weights=replace(settings.weights, beside=0.0))
     carriers = ActiveCarriers(track, color_cell)
-    decoder = appearance.decoder
+    decoder = look.decoder
     parameters = list(decoder.parameters())
     heads = Adam([{"params": parameters, "lr": settings.learning_rate_heads}])
-    scales = RowAdam(appearance.log_scales, settings.learning_rate_scales)
+    scales = RowAdam(look.log_scales, settings.learning_rate_scales)
     features = SharedFeatures(
-        appearance.features,
+        look.features,
         track.carriers,
         carriers.ids,
         settings.feature_cells,
@@ -325,8 +271,8 @@ def fit_appearance(
         seed,
     )
     rng = np.random.default_rng([seed, 1])
-    size = appearance.features.shape[1] + appearance.log_scales.shape[1]
-    measured = Sensitivities(track.carriers.count, size) if settings.measured_share > 0 else None
+    size = look.features.shape[1] + look.log_scales.shape[1]
+    measured = Sensitivities(track.carriers.count, size, device) if settings.measured_share > 0 else None
     withheld_targets = np.zeros(len(targets), dtype=bool)
     schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
     if clock is not None:
@@ -368,53 +314,56 @@ def fit_appearance(
         return *shown(children, target, active), penalty_terms
 
     def learned(t: int, active: Active) -> list[Tensor]:
-        return [features.of_frame(t, active.places), appearance.log_scales.index_select(0, active.ids)]
+        return [features.of_frame(t, active.places), look.log_scales.index_select(0, active.ids)]
 
     @torch.no_grad()
     def withheld_look() -> WithheldLook:
         weights, total, quality = settings.weights, 0.0, []
         for number in np.nonzero(withheld_targets)[0]:
             target = targets[number].coarse or targets[number]  # of one size at all looks
-            active = carriers.of(target)
+            active, target = carriers.of(target).to(device), target.to(device)
             values = learned(target.frame, active)
             if averages is not None:
                 mean = averages.of(active.ids, torch.cat(values, dim=1))
                 values = list(mean.split([values[0].shape[1], values[1].shape[1]], dim=1))
             image, alpha, _ = seen(target, active, [table.contiguous() for table in values], penalised=False)
-            photograph = read_now(target.photograph)
+            photograph = read_now(target.photograph).to(device)
             total += float(image_loss(image, alpha, photograph, target.area, weights, weights.ssim))
             quality.append(masked_psnr(image, photograph))
         return WithheldLook(total / int(withheld_targets.sum()), np.array(quality))
 
     @torch.no_grad()
     def idle(target: TrainingTarget, active: Active) -> Tensor:
-        feature_rows, scale_rows = learned(target.frame, active)
-        children, _ = decoder.decode(feature_rows, scale_rows, None, active.state, target.eye)
+        active = active.to(device)
         # Colours of all tiles: liquid drawn beside the mask is to be taught that it does not belong there.
-        whole = replace(target.coarse or target, modes=None)
+        whole = replace((target.coarse or target).to(device), modes=None)
+        feature_rows, scale_rows = learned(target.frame, active)
+        children, _ = decoder.decode(feature_rows, scale_rows, None, active.state, whole.eye)
 
         def drawn(colors: Tensor) -> Tensor:
             return shown(replace(children, colors=colors), whole, active)[0]
 
-        return least(contributions(children.colors, drawn), settings.idle_share)
+        return least(contributions(children.colors, drawn), settings.idle_share).cpu()
 
     @torch.no_grad()
     def state() -> tuple[Appearance, np.ndarray]:
         assert shown_heads is not None
-        look = Appearance(features.all(), appearance.log_scales, shown_heads.decoder(), appearance.glass)
-        return look, carriers.left(track.carriers.count)
+        so_far = Appearance(features.all(), look.log_scales, shown_heads.decoder(), look.glass)
+        return so_far.to(CPU), carriers.left(track.carriers.count)
 
     @torch.no_grad()
     def drawn(
         number: int, every_feature: Tensor, every_scale: Tensor, opacity: Tensor | None
     ) -> tuple[Tensor, WindowPhotograph]:
-        target = targets[number]
-        active = carriers.of(target)
+        target = targets[number].to(device)
+        active = carriers.of(targets[number])
         if opacity is not None:
             left, before = opacity.index_select(0, active.ids), active.state.visibility
             active = replace(active, state=replace(active.state, visibility=left if before is None else left * before))
-        children, _ = decoder.decode(every_feature, every_scale, active.ids, active.state, target.eye)
-        return shown(children, replace(target, modes=None), active)[0], read_now(target.photograph)
+        values = [table.index_select(0, active.ids).to(device) for table in (every_feature, every_scale)]
+        active = active.to(device)
+        children, _ = decoder.decode(values[0], values[1], None, active.state, target.eye)
+        return shown(children, replace(target, modes=None), active)[0].cpu(), read_now(target.photograph)
 
     def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
         """`target` in the size that it has at `iteration`."""
@@ -434,8 +383,8 @@ def fit_appearance(
     while True:
         if schedule.due(iteration):
             with nullcontext() if averages is None else averages.heads():
-                look = withheld_look()
-            schedule.look(iteration, look)
+                found = withheld_look()
+            schedule.look(iteration, found)
         factor = schedule.factor(iteration)
         if settle is not None and (factor is None or schedule.done(iteration) >= settings.plates_share):
             if offer is not None and iteration >= shown_from:
@@ -451,16 +400,16 @@ def fit_appearance(
             fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
-            carriers.drop(decoder.mean_opacity(features.all()).detach() < settings.prune_opacity)
+            carriers.drop((decoder.mean_opacity(features.all()).detach() < settings.prune_opacity).cpu())
             features.keep(carriers.ids)
         if settings.idle_share > 0 and focusings.come(iteration, schedule) and iteration >= seen_before * len(targets):
             carriers.focus(idle, targets)
             features.keep(carriers.ids)
         target = targets[queue.pop()]
-        active = carriers.of(target)
+        active = carriers.of(target).to(device)
         values = [table.requires_grad_() for table in learned(target.frame, active)]
-        target = sized(target, iteration)
-        photograph = reader.get(target.photograph)
+        target = sized(target, iteration).to(device)
+        photograph = reader.get(target.photograph).to(device)
         if queue:
             reader.prepare(sized(targets[queue[-1]], iteration + 1).photograph)
         image, alpha, penalty_terms = seen(target, active, values, penalised=True)
@@ -502,7 +451,8 @@ def fit_appearance(
     reader.close()
     if glass is not None:
         glass.done()
-    appearance.features = features.all()
+    look.features = features.all()
+    appearance.become(look.to(CPU))
     return Fit(
         history,
         carriers.left(track.carriers.count),

@@ -72,6 +72,10 @@ class Glass:
         factors = ellipsoids(self.log_scales, self.quaternions)
         return Splats(self.positions, factors, torch.sigmoid(self.opacities), colors)
 
+    def to(self, device: str) -> Glass:
+        """A copy on `device`."""
+        return Glass(**{name: table.detach().to(device, copy=True) for name, table in self.tables.items()})
+
     @torch.no_grad()
     def kept(self, least_opacity: float) -> Glass:
         """A copy, without those that are more transparent than `least_opacity`."""

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splashbench.gaussians.ssim import SsimTarget, ssim
+from splashbench.gaussians.ssim import SsimTarget, ssim, ssim_by_torch
+
+from ..kernel.window_loss import WindowPhotograph, window_losses
 
 EPSILON = 1e-6
 SEPARATION_MARGIN = 0.6
@@ -57,12 +59,34 @@ def gradient_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
     """1 - SSIM of two [h, w, 3] images, differentiable by the first."""
+    if image.device.type != "cpu":
+        return 1 - ssim_by_torch(image, target.permute(2, 0, 1))
     return 1 - ssim(image, SsimTarget(target))
 
 
 def silhouette_loss(alpha: Tensor, mask: Tensor, area: float) -> Tensor:
     """L1 between rendered foreground opacity and mask over `area` pixels (the paper: of the image)."""
     return (alpha - mask).abs().sum() / area
+
+
+def image_terms(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:
+    """(foreground, gradient, silhouette) of a window, the last one summed over its pixels: on the CPU by the kernel,
+    which works in one pass, and elsewhere by `image_terms_by_torch`."""
+    by = window_losses if image.device.type == "cpu" else image_terms_by_torch
+    return by(image, alpha, photograph)
+
+
+def image_terms_by_torch(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:
+    """`image_terms` by torch's operations, on the device where all lie."""
+    inside, truth = image[photograph.box], photograph.image.to(torch.float32) / 255
+    mask = photograph.mask.to(torch.float32)
+    whole = torch.zeros_like(alpha)
+    whole[photograph.box] = mask
+    return (
+        foreground_loss(inside, truth, mask),
+        gradient_loss(inside, truth, mask),
+        silhouette_loss(alpha, whole, area=1.0),
+    )
 
 
 def covariance_loss(factors: Tensor, voxel: float) -> Tensor:

@@ -41,11 +41,12 @@ class Sensitivity:
 
 
 class Sensitivities:
-    """Adds up, photograph by photograph, how much each changes with the values of `count` carriers, `size` each."""
+    """Adds up, photograph by photograph, how much each changes with the values of `count` carriers, `size` each, on
+    `device`."""
 
-    def __init__(self, count: int, size: int) -> None:
-        self._metric = torch.zeros(size, size, dtype=torch.float64)
-        self._squares = torch.zeros(count)
+    def __init__(self, count: int, size: int, device: str = "cpu") -> None:
+        self._metric = torch.zeros(size, size, dtype=torch.float64, device=device)
+        self._squares = torch.zeros(count, device=device)
         self._first: list[tuple[Tensor, Tensor]] = []
         self._whiten: Tensor | None = None
 
@@ -67,7 +68,7 @@ class Sensitivities:
             return None
         seen = max(int((self._squares > 0).sum()), 1)
         mean = float(self._squares.sum()) / seen
-        return Sensitivity((self._metric / seen).numpy(), (self._squares / max(mean, 1e-30)).numpy())
+        return Sensitivity((self._metric / seen).cpu().numpy(), (self._squares / max(mean, 1e-30)).cpu().numpy())
 
     def _measure_first(self) -> None:
         if self._first:

@@ -37,10 +37,10 @@ class _FeatureLevel:
 class SharedFeatures:
     """The features of `carriers` as sums; see above.
 
-    own: float32 [count, width], the carriers' own parts at first; updated in place. ids: int64 [n] of each frame, its
-    carriers' rows there. sizes: of the cells, in transport voxels and, by the same number, in frames; none where
-    nothing is shared. still_size: of cells that last for all frames, in transport voxels; 0 for none. own_rate,
-    shared_rate: of learning.
+    own: float32 [count, width], the carriers' own parts at first; updated in place. All lies where it does. ids: int64
+    [n] of each frame, its carriers' rows there. sizes: of the cells, in transport voxels and, by the same number, in
+    frames; none where nothing is shared. still_size: of cells that last for all frames, in transport voxels; 0 for
+    none. own_rate, shared_rate: of learning.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class SharedFeatures:
         seed: int,
     ) -> None:
         self._own, self._adam = own, RowAdam(own, own_rate)
-        self._ids = ids
+        ids = self._ids = [of_frame.to(own.device) for of_frame in ids]
         self._levels: list[_FeatureLevel] = []
         extents = [(size, size) for size in sizes]
         if still_size > 0:
@@ -66,13 +66,13 @@ class SharedFeatures:
         # Cells of different sizes have their faces at different places.
         rng = np.random.default_rng([seed, 4])
         for size, frames in extents:
-            cells = torch.from_numpy(cells_of(born, size, frames, rng.random(4)))
+            cells = torch.from_numpy(cells_of(born, size, frames, rng.random(4))).to(own.device)
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
             self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), *_by_frame(cells, ids)))
 
     def keep(self, ids: list[Tensor]) -> None:
         """Go on with the carriers `ids` of each frame alone."""
-        self._ids = ids
+        ids = self._ids = [of_frame.to(self._own.device) for of_frame in ids]
         self._levels = [
             replace(level, rows=rows, members=members)
             for level in self._levels
@@ -85,7 +85,7 @@ class SharedFeatures:
 
     def all(self) -> Tensor:
         """Features of all carriers, [count, width]."""
-        return self._sum(torch.arange(len(self._own)))
+        return self._sum(torch.arange(len(self._own), device=self._own.device))
 
     def step(self, t: int, gradient: Tensor, factor: float, places: Tensor | None = None) -> None:
         """Descend along the `gradient` [n, width] of what `of_frame` gave; `factor` scales the rates."""

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.gaussians.devices import CPU
 from splashbench.render import Frozen, tile_modes
 from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
@@ -65,6 +66,13 @@ class TrainingTarget:
     in_front: Tensor | None = None
     corner: tuple[int, int] = (0, 0)
     coarse: TrainingTarget | None = None
+
+    def to(self, device: str) -> TrainingTarget:
+        """The same with what it is rendered by on `device`: the photograph stays, and what the container hides."""
+        if device == CPU:
+            return self
+        wall = None if self.wall is None else self.wall.to(device)
+        return replace(self, eye=self.eye.to(device), background=self.background.to(device), wall=wall)
 
 
 def _extent(mask: np.ndarray, margin: int) -> tuple[int, int, int, int]:
@@ -129,11 +137,11 @@ def _modes(camera: Camera, box: tuple[int, int, int, int]) -> np.ndarray:
     return tile_modes(read)
 
 
-def set_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray]) -> None:
-    """Put others behind `targets`, in place; backgrounds: as for `collect_targets`."""
+def set_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray], device: str = CPU) -> None:
+    """Put others behind `targets`, in place, on `device`; backgrounds: as for `collect_targets`."""
+    images = {name: torch.from_numpy(image).to(device) for name, image in backgrounds.items()}
     for target in targets:
-        image = torch.from_numpy(backgrounds[target.camera.name])
-        target.background = windowed(image, target.corner, target.camera)
+        target.background = windowed(images[target.camera.name], target.corner, target.camera)
 
 
 def windowed(image: Tensor, corner: tuple[int, int], camera: Camera) -> Tensor:

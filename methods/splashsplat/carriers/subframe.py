@@ -59,6 +59,11 @@ class CarrierState:
     phi: Tensor
     visibility: Tensor | None = None
 
+    def to(self, device: str) -> CarrierState:
+        """The same on `device`."""
+        visibility = None if self.visibility is None else self.visibility.to(device)
+        return CarrierState(self.positions.to(device), self.deformation.to(device), self.phi.to(device), visibility)
+
 
 @dataclass(frozen=True)
 class Track:
@@ -73,10 +78,13 @@ class Track:
         """Numbers of the carriers of frame `t`, int64 [n]."""
         return torch.from_numpy(self.carriers.ids[self.carriers.rows(t)].astype(np.int64))
 
-    def state(self, t: int, fraction: float = 0.0) -> CarrierState:
-        """Decoder input of frame `t`'s carriers, a `fraction` in (-1, 1) of a step after the frame; see `locate`."""
-        positions, deformation = self.moved(t, fraction)
-        phi = self.carriers.phi[self.carriers.rows(t)]
+    def state(self, t: int, fraction: float = 0.0, places: np.ndarray | None = None) -> CarrierState:
+        """Decoder input of frame `t`'s carriers, a `fraction` in (-1, 1) of a step after the frame; see `locate`.
+
+        places: int64 [n], which of the frame's carriers; None for all.
+        """
+        positions, deformation = self.moved(t, fraction, places)
+        phi = _at(self.carriers.phi[self.carriers.rows(t)], places)
         if fraction != 0 and len(positions):
             other = t + 1 if fraction > 0 else t - 1
             nearer, farther = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
@@ -91,11 +99,19 @@ class Track:
             positions = self.motion.step(t if fraction > 0 else t - 1).moved(positions, fraction)
         return self.grid.to_scene(positions).astype(np.float32)
 
-    def moved(self, t: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
-        """Where frame `t`'s carriers are (transport grid), and their F, a `fraction` of a step after the frame."""
+    def moved(self, t: int, fraction: float, places: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Where frame `t`'s carriers are (transport grid), and their F, a `fraction` of a step after the frame.
+
+        places: as for `state`.
+        """
         rows = self.carriers.rows(t)
-        positions = self.carriers.positions[rows]
-        deformation = self.carriers.deformation[rows].astype(np.float32, copy=False)
+        positions = _at(self.carriers.positions[rows], places)
+        deformation = _at(self.carriers.deformation[rows], places).astype(np.float32, copy=False)
         if fraction == 0 or len(positions) == 0:
             return positions, deformation
         return self.motion.step(t if fraction > 0 else t - 1).forecast(positions, deformation, fraction)
+
+
+def _at(values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
+    """The rows of `values` at `places`; all of them without."""
+    return values if places is None else values.take(places, axis=0)

@@ -29,7 +29,7 @@ from .library import KERNEL, WindowStruct
 class WindowPhotograph:
     """What a camera saw of a box within the window, where alone there is liquid.
 
-    image: uint8 [rows, columns, 3]; mask: bool [rows, columns]; both contiguous, on the CPU. top, left: of the box.
+    image: uint8 [rows, columns, 3]; mask: bool [rows, columns]; both contiguous. top, left: of the box.
     """
 
     image: Tensor
@@ -42,6 +42,12 @@ class WindowPhotograph:
         """Rows and columns of the window."""
         rows, columns = self.mask.shape
         return slice(self.top, self.top + rows), slice(self.left, self.left + columns)
+
+    def to(self, device: str) -> WindowPhotograph:
+        """On `device`: this itself where it is there."""
+        if self.image.device.type == torch.device(device).type:
+            return self
+        return WindowPhotograph(self.image.to(device), self.mask.to(device), self.top, self.left)
 
 
 def window_losses(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:

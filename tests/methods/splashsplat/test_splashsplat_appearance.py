@@ -12,8 +12,8 @@ from splashbench.render import freeze, rasterize_arrays
 from splashbench.scene import Camera
 from splashbench_methods.splashsplat.appearance import losses
 from splashbench_methods.splashsplat.appearance.averages import ShownHeads
+from splashbench_methods.splashsplat.appearance.compositing import composite
 from splashbench_methods.splashsplat.appearance.decoder import Children, Decoder, DecoderSettings
-from splashbench_methods.splashsplat.appearance.fitting import composite
 from splashbench_methods.splashsplat.appearance.optimizer import RowAdam
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState
 

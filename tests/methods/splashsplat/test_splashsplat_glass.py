@@ -16,8 +16,8 @@ from splashbench.observe.grid import Grid
 from splashbench.scene import Camera, Scene
 from splashbench_methods.splashsplat import SplashSplatConfig
 from splashbench_methods.splashsplat.appearance import losses
+from splashbench_methods.splashsplat.appearance.compositing import composite
 from splashbench_methods.splashsplat.appearance.decoder import Children
-from splashbench_methods.splashsplat.appearance.fitting import composite
 from splashbench_methods.splashsplat.appearance.glass import Glass, GlassFit, Splats, glass_before
 from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.subframe import Track

@@ -19,8 +19,8 @@ from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.scene import Scene, TrainingScene
+from splashbench_methods.splashsplat.appearance.compositing import composite
 from splashbench_methods.splashsplat.appearance.decoder import Children
-from splashbench_methods.splashsplat.appearance.fitting import composite
 from splashbench_methods.splashsplat.fields import observations
 from splashbench_methods.splashsplat.fields.container import ContainerSource, KnownContainer
 from splashbench_methods.splashsplat.fields.near_wall import NearWall, near_wall, room_beside

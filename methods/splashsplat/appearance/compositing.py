@@ -1,0 +1,95 @@
+"""Liquid over its background: the image of a window, and the opacity of the liquid alone (Eq. rendering).
+
+Liquid lies in front of the background, is drawn together with it by depth, is cut by a container's near wall, or stands
+behind a container's glass.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splashbench.render import Frozen, rasterize
+from splashbench.scene.camera import Camera
+
+from .decoder import Children
+from .glass import Splats
+
+
+def composite(
+    children: Children,
+    camera: Camera,
+    background: Tensor,
+    frozen: Frozen | None = None,
+    modes: np.ndarray | None = None,
+    wall: Tensor | None = None,
+    in_front: Tensor | None = None,
+    glass: Splats | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Liquid and background: rgb [h, w, 3], and the opacity [h, w] of the liquid alone.
+
+    background: [h, w, 3] or [3], behind everything. frozen: the background's Gaussians for this camera, which are drawn
+    in one order of depth with the liquid's (Eq. rendering); without them the liquid lies in front. modes: the tiles
+    in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall,
+    which the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same.
+    glass: Gaussians that are no liquid, drawn in one order of depth with the liquid's.
+    Only one of frozen, wall and glass. The opacity is "obtained by rasterizing G^fg alone" (supplement).
+    """
+    shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
+    colors = children.colors.flatten(0, 1)
+    image: Tensor
+    alpha: Tensor
+    if glass is not None:
+        assert frozen is None
+        assert wall is None
+        image, alpha = _with_glass(shapes, colors, camera, background, glass)
+    elif frozen is None and wall is not None:
+        image, alpha = _behind_wall(shapes, colors, camera, background, wall, in_front)
+    elif frozen is None:
+        image, alpha = rasterize(*shapes, colors, camera, background=background)
+    else:
+        image, _ = rasterize(*shapes, colors, camera, background=background, frozen=frozen, modes=modes)
+        _, alpha = rasterize(*shapes, None, camera)
+    return image, alpha
+
+
+def _with_glass(
+    shapes: tuple[Tensor, Tensor, Tensor], colors: Tensor, camera: Camera, background: Tensor, glass: Splats
+) -> tuple[Tensor, Tensor]:
+    """`composite` where glass stands before the liquid: its share of each pixel is a channel of its own."""
+    theirs = glass.means, glass.factors, glass.opacities
+    means, factors, opacities = (torch.cat(pair) for pair in zip(shapes, theirs))
+    parts = [torch.cat([c, c.new_full((len(c), 1), is_liquid)], 1) for c, is_liquid in ((colors, 1), (glass.colors, 0))]
+    behind = torch.cat([background, background.new_zeros(*background.shape[:-1], 1)], -1)
+    drawn, _ = rasterize(means, factors, opacities, torch.cat(parts), camera, background=behind)
+    return drawn[..., :3], drawn[..., 3]
+
+
+def _behind_wall(
+    shapes: tuple[Tensor, Tensor, Tensor],
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor,
+    wall: Tensor,
+    in_front: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """`composite` where a wall cuts the liquid, except for the carriers `in_front` of it."""
+    if in_front is None or not bool(in_front.any()):
+        image, alpha = rasterize(*shapes, colors, camera, background=background)
+        return image + wall[..., None] * (background - image), alpha * (1 - wall)
+    # Children of one carrier follow each other.
+    drawn_last = in_front.repeat_interleave(len(colors) // len(in_front))
+
+    def part(chosen: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:
+        rows = chosen.nonzero()[:, 0]
+        means, factors, opacities = (values.index_select(0, rows) for values in shapes)
+        drawn: tuple[Tensor, Tensor] = rasterize(
+            means, factors, opacities, colors.index_select(0, rows), camera, background=behind
+        )
+        return drawn
+
+    image, alpha = part(~drawn_last, background)
+    image, alpha = image + wall[..., None] * (background - image), alpha * (1 - wall)
+    over, opacity = part(drawn_last, None)
+    return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
