@@ -34,23 +34,21 @@ Draft = tuple[Liquid, "Background", LiquidOcclusion | None]
 def make_draft(
     scene: TrainingScene,
     config: SplashSplatConfig,
-    seed: int,
-    device: str,
+    run: Run,
     known: KnownContainer,
     plates: Callable[[], Plates],
     offer: Callable[[Callable[[], Draft], bool], None],
 ) -> Background:
     """Fit a draft of `scene`; returns its background.
 
-    config: that of the fit. device: see `Run`. plates: gives what the training views show without the liquid. offer: is
-    given what makes the draft as it is, and whether there will be no other for a while; at the end, too.
+    config: that of the fit. run: see `Run.aside`. plates: gives what the training views show without the liquid. offer:
+    is given what makes the draft as it is, and whether there will be no other for a while; at the end, too.
     """
     from ..scaffold_gs import BackgroundSettings, clean_plates, completed, fit_background, flat_background
 
     first = clean_plates(scene, n_frames=1)
     background = flat_background(first)
-    # A run of its own: nothing in it counts as a stage, a note or a part that others may take over.
-    run, coarse = Run(seed=seed, device=device), config.draft()
+    coarse = config.draft()
 
     def settled() -> dict[str, np.ndarray]:
         nonlocal background

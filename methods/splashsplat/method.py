@@ -14,6 +14,7 @@ import torch
 from splashbench.gaussians.devices import CPU, GaussianMethod
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Render, Run, Support
+from splashbench.parallel import thread_count
 from splashbench.render import Frozen, freeze
 from splashbench.scene.camera import Camera
 from splashbench.scene.gaussians import Gaussians
@@ -26,8 +27,10 @@ from splashbench.selfcalibration import self_calibration
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
 from .appearance.compositing import composite
 from .appearance.decoder import Children
+from .appearance.warm_start import Learned
 from .carriers.between import carriers_at
 from .carriers.subframe import CarrierState
+from .coarse_fit import CoarseFit, begins_on_coarse_grids, fit_coarsely
 from .draft import make_draft
 from .fields.container import known_container
 from .fields.occlusion import LiquidOcclusion
@@ -40,8 +43,9 @@ if TYPE_CHECKING:
     from ..scaffold_gs import Background
 
 MIN_VIEWS = 2
-# Share of the time that everything before the appearance takes, for the progress bar only.
-_BEFORE = 0.35
+# Shares of the time that the fit on coarse grids takes, and everything else before the appearance, for the progress bar
+# only.
+_COARSE, _BEFORE = 0.2, 0.35
 
 
 class FittedSplashSplat(Fitted):
@@ -227,8 +231,7 @@ class SplashSplat(GaussianMethod):
                 drafted = make_draft(
                     scene,
                     config,
-                    run.seed,
-                    run.device,
+                    run.aside(),
                     known,
                     plates,
                     lambda state, milestone: run.checkpoint(lambda: FittedSplashSplat(*state()), milestone),
@@ -250,30 +253,11 @@ class SplashSplat(GaussianMethod):
                 behind = completed(plates(), background)
             # What is shown on the way; the liquid is fitted before the plates, whether there was a draft or not.
             background = drafted or background
-        if run.budget.limits and known is None:  # it is asked for by every trace on the way to the one that is kept
+        # Every trace on the way to the one that is kept asks for it.
+        if known is None and (run.budget.limits or begins_on_coarse_grids(config, run)):
             known = known_container(scene, config.container, config.container_masks)
         spent = within_seconds(scene, config, run, known)
         config, settings = spent.config, config.background.model_copy(update=background_update(config, run))
-
-        def trace(part: Run) -> Traced:
-            return within_bytes(config, part, lambda coarser: trace_liquid(scene, coarser, part, known), spent.traced)
-
-        late, traced = run.ahead(fit_background, trace, span=(0, _BEFORE))
-        if config.composition == "together":
-            background = late()
-            behind = dict.fromkeys(scene.train, background.far_color)
-            frozen = {
-                name: freeze(*background.gaussians(scene.cameras[name]), scene.cameras[name]) for name in scene.train
-            }
-        elif not deferred:
-            background = late()
-            behind = background.seen_by(scene)
-        else:
-
-            def settled() -> dict[str, np.ndarray]:
-                nonlocal background
-                background = late()
-                return background.seen_by(scene)
 
         def offer(state: Callable[[], Reconstruction], milestone: bool) -> None:
             run.checkpoint(lambda: FittedSplashSplat(*with_background(*state())), milestone)
@@ -283,6 +267,52 @@ class SplashSplat(GaussianMethod):
         ) -> tuple[Liquid, Background, LiquidOcclusion | None]:
             return liquid, background, occlusion
 
+        watched = offer if run.watched else None
+        coarse: CoarseFit | None = None
+        learned: list[Learned] | None = None
+        start = _BEFORE
+        if begins_on_coarse_grids(config, run):
+            with run.stage("coarse fit"):
+                coarse = fit_coarsely(scene, config, run, known, behind, watched, (0, _COARSE))
+
+        def trace(part: Run) -> Traced:
+            return within_bytes(config, part, lambda coarser: trace_liquid(scene, coarser, part, known), spent.traced)
+
+        if coarse is not None:
+            # On one core the background comes before the trace: what is shown meanwhile gains by it.
+            shown = coarse.reconstruction if watched is not None and thread_count() == 1 else None
+
+            def fit_background_first(part: Run) -> Background:
+                nonlocal background
+                made = fit_background(part)
+                if watched is not None and shown is not None:
+                    background, before = made, shown
+                    watched(lambda: before, True)
+                return made
+
+            background, traced = run.side_by_side(fit_background_first, trace, span=(_COARSE, _COARSE + _BEFORE))
+            behind = background.seen_by(scene)
+            learned, start = coarse.learned, _COARSE + _BEFORE
+            coarse = shown = None  # large
+        else:
+            late, traced = run.ahead(fit_background, trace, span=(0, _BEFORE))
+            if config.composition == "together":
+                background = late()
+                behind = dict.fromkeys(scene.train, background.far_color)
+                frozen = {
+                    name: freeze(*background.gaussians(scene.cameras[name]), scene.cameras[name])
+                    for name in scene.train
+                }
+            elif not deferred:
+                background = late()
+                behind = background.seen_by(scene)
+            else:
+
+                def settled() -> dict[str, np.ndarray]:
+                    nonlocal background
+                    background = late()
+                    return background.seen_by(scene)
+
         room = None
         if run.budget.storage_bytes is not None:
             limit = run.budget.storage_bytes
@@ -290,8 +320,7 @@ class SplashSplat(GaussianMethod):
             def room() -> int:
                 return limit - background.stored_bytes
 
-        watched = offer if run.watched else None
-        found = fit_liquid(scene, behind, traced, run, (_BEFORE, 1), frozen, watched, settled, room)
+        found = fit_liquid(scene, behind, traced, run, (start, 1), frozen, watched, settled, room, learned)
         if settled is not None:
             background = late()  # a fit without any photograph asked for none
         return FittedSplashSplat(*with_background(*found))

@@ -29,6 +29,7 @@ from .appearance.iterations import iterations_decision
 from .appearance.schedule import Clock
 from .appearance.sensitivity import Sensitivity
 from .appearance.targets import collect_targets, set_backgrounds
+from .appearance.warm_start import Learned, hand_on
 from .carriers.coverage import uncovered_by_any
 from .carriers.subframe import Track
 from .carriers.tracking import CarrierTracker, Simulation, Tracking
@@ -110,6 +111,8 @@ def fit_liquid(
     offer: Callable[[Callable[[], Reconstruction], bool], None] | None = None,
     settled: Callable[[], dict[str, np.ndarray]] | None = None,
     room: Callable[[], int] | None = None,
+    learned: list[Learned] | None = None,
+    keep: Callable[[Learned], None] | None = None,
 ) -> Reconstruction:
     """Fit the appearance of the liquid of `scene`; returns it, and what hides it from cameras.
 
@@ -118,7 +121,9 @@ def fit_liquid(
     part of `run`'s progress this takes up. offer: is given, after iterations of the appearance, what makes the
     reconstruction as if the fit ended there, and whether there will be no other for a while. settled: where given,
     `backgrounds` are for the first iterations (`plates_share`), and this gives those for the others.
-    room: where given, the bytes that the liquid may take, asked for at the end.
+    room: where given, the bytes that the liquid may take, asked for at the end. learned: on coarser grids, to begin
+    with; taken out of the list, as it is large. keep: is given what was learned of all carriers, where there is any
+    photograph.
     """
     config, observations, track = traced.config, traced.observations, traced.track
     occlusion = observations.occlusion
@@ -146,7 +151,7 @@ def fit_liquid(
         offer(lambda: as_it_is(*state()), milestone)
 
     with run.stage("appearance"), one_torch_thread():
-        appearance, fit = _fit_appearance(
+        found, fit = _fit_appearance(
             track,
             observations,
             occlusion,
@@ -160,7 +165,11 @@ def fit_liquid(
             settled,
             _clock(run),
             run.device,
+            learned,
         )
+    appearance = found.appearance
+    if keep is not None and fit is not None:
+        keep(found)
     if fit is not None and fit.earned:
         run.decide(iterations_decision(fit.earned, len(fit.losses)))
     if fit is None:
@@ -286,9 +295,10 @@ def _fit_appearance(
     settled: Callable[[], dict[str, np.ndarray]] | None,
     clock: Clock | None,
     device: str,
-) -> tuple[Appearance, Fit | None]:
-    """The appearance of the carriers of `track`, fitted to the photographs whose masks did not fail; None where there
-    are none."""
+    learned: list[Learned] | None,
+) -> tuple[Learned, Fit | None]:
+    """What was learned of the carriers of `track`, fitted to the photographs whose masks did not fail; None where there
+    are none. learned: what it begins with."""
     voxel = observations.grid.voxel
     appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
     # Gaussians of the background that are drawn together with the liquid's are prepared for one size.
@@ -318,9 +328,14 @@ def _fit_appearance(
         # Edges have so many more pixels along them.
         appearance.glass = glass_before(track, round(config.glass * longest / _GLASS_SIDE), seed)
     if not targets:
-        return appearance, None
-    if config.first_look:
-        take_on(photographed(track, targets), appearance.features, appearance.decoder)
+        return Learned(track, appearance, None), None
+    look = photographed(track, targets) if config.first_look else None
+    optimisation = config.optimisation
+    if learned:
+        hand_on(learned.pop(), track, look, appearance, config.base_scale)
+        optimisation = replace(optimisation, begun=config.coarse_iterations)
+    elif look is not None:
+        take_on(look, appearance.features, appearance.decoder)
     if device != CPU:
         set_backgrounds(targets, backgrounds, device)
         set_smaller_backgrounds(targets, backgrounds, device)
@@ -334,9 +349,19 @@ def _fit_appearance(
             backgrounds.clear()  # nobody needs those of before, which are large
 
     fit = fit_appearance(
-        appearance, track, targets, config.optimisation, color_cell, seed, progress, offer, settle, clock, device
+        appearance,
+        track,
+        targets,
+        optimisation,
+        color_cell,
+        seed,
+        progress,
+        offer,
+        settle,
+        clock,
+        device,
     )
-    return appearance, fit
+    return Learned(track, appearance, look), fit
 
 
 def _pruned(track: Track, appearance: Appearance, kept: np.ndarray) -> tuple[Track, Appearance]:

@@ -35,12 +35,15 @@ _DRAFT_ITERATIONS = 1000
 _DRAFT_PLATES_SHARE = 0.25
 # And the edge of its hull voxels in pixels, and how few there are at least.
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
+# Hull cells of the coarse grids, at most. Edge of their voxels at the least, in fine ones: in an opaque container, and
+# in a transparent one.
+_COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 
 # Share of the iterations, the last ones, in which it is measured what may be stored how coarsely.
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "20"
+VERSION = "21"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -163,6 +166,10 @@ class SplashSplatConfig(MethodConfig):
     # Optimisation
     #: steps of the appearance's fit, at most
     iterations: int = Field(4000, ge=0)
+    #: share of them, the first ones, made on coarse grids, whose carriers the fine ones begin with; 0 for none. Only
+    #: where the schedule is fixed, the background is not fitted first (`plates_share`), and no budget is to be kept.
+    #: The background is fitted after them
+    coarse_grids_share: float = Field(0.2, ge=0, le=0.5)
     #: learning rate of carriers' own features
     learning_rate_features: PositiveFloat = 0.06
     #: learning rate of the features that carriers of a cell share
@@ -216,7 +223,7 @@ class SplashSplatConfig(MethodConfig):
     prune_opacity: float = Field(0.01, ge=0, lt=1)
     #: carriers that together make up no more than this share of a photograph are not fitted to it; 0 fits all
     idle_share: float = Field(0.02, ge=0, le=0.2)
-    #: such carriers are looked for a tenth of the iterations in already, not from a fifth on
+    #: such carriers are looked for sooner as well: after another tenth of the iterations
     idle_early: bool = False
     #: the same in a transparent container; violent liquid in an opaque one loses by it, as opacities say little so soon
     clear_idle_early: bool = True
@@ -229,7 +236,8 @@ class SplashSplatConfig(MethodConfig):
     #: pixels along the longest side beyond which photographs are large enough for that
     coarse_side: PositiveInt = 1500
     #: share of the iterations, the first ones, that have the footage's clean plates behind the liquid: the background
-    #: is fitted afterwards; 0 fits it first. Not where it is drawn "together" with the liquid
+    #: is fitted afterwards; 0 fits it first. Not where it is drawn "together" with the liquid; where there are coarse
+    #: grids, `coarse_grids_share` instead
     plates_share: float = Field(0.2, ge=0, le=1)
     #: by how much rounding what is stored may raise the squared error in training photographs, as a share of it; 0
     #: stores in steps of a twentieth of each value's spread
@@ -263,6 +271,7 @@ class SplashSplatConfig(MethodConfig):
             "observable": True,
             "validation_share": 0.04,
             "price": 0.1,
+            "coarse_grids_share": 0.0,
         },
         "paper": {
             "hull_cells": 176,
@@ -303,6 +312,7 @@ class SplashSplatConfig(MethodConfig):
             "feature_size": 32,
             "color_width": 64,
             "iterations": 3000,
+            "coarse_grids_share": 0.0,
             "learning_rate_features": 2e-3,
             "learning_rate_heads": 2e-3,
             "learning_rate_scales": 2e-3,
@@ -336,6 +346,7 @@ class SplashSplatConfig(MethodConfig):
             "max_per_cell": 4,
             "shell_outside": 0.125,
             "iterations": 800,
+            "coarse_grids_share": 0.0,
             "plates_share": 0.0,
             "validation_share": 0.04,
             "ssim_every": 2,
@@ -356,6 +367,11 @@ class SplashSplatConfig(MethodConfig):
     def control_factor(self) -> int:
         """Transport voxels per control cell."""
         return max(1, round(self.transport_cells / self.control_cells))
+
+    @property
+    def coarse_iterations(self) -> int:
+        """Of the iterations, the first ones, those that are made on coarse grids."""
+        return round(self.coarse_grids_share * self.iterations)
 
     @property
     def background(self) -> BackgroundSettings:
@@ -436,6 +452,7 @@ class SplashSplatConfig(MethodConfig):
                 "shell_depth": 3.0,
                 "still_cell": 0.0,
                 "iterations": _DRAFT_ITERATIONS,
+                "coarse_grids_share": 0.0,
                 "validation_share": 0.0,
                 "idle_share": 0.0,
                 "glass": 0,
@@ -444,6 +461,33 @@ class SplashSplatConfig(MethodConfig):
                 "storage_tolerance": 0.0,
             }
         )
+
+    def coarse(self) -> SplashSplatConfig:
+        """The settings of the fit on coarse grids that the fit begins with."""
+        return self.model_copy(
+            update={
+                "hull_cells": self._coarser(self.hull_cells, _COARSE_CELLS, 16),
+                "transport_cells": self._coarser(self.transport_cells, _COARSE_CELLS // 2, 8),
+                "control_cells": self._coarser(self.control_cells, _COARSE_CELLS // 8, 4),
+                "fewest_cells": self._coarser(self.fewest_cells, _COARSE_CELLS, 16),
+                "voxel_pixels": _COARSE_PIXELS * self.voxel_pixels,
+                "clear_voxel_pixels": _COARSE_PIXELS_CLEAR * self.clear_voxel_pixels,
+                "cell_capacity": 6,
+                "min_per_cell": 3,
+                "max_per_cell": 4,
+                "shell_outside": 0.125,
+                "iterations": self.coarse_iterations,
+                "coarse_grids_share": 0.0,
+                "coarse_share": 1.0,
+                "coarsest_share": 1.0 if self.coarsest_share > 0 else 0.0,
+                "plates_share": 0.0,  # nothing else comes behind the liquid
+                "storage_tolerance": 0.0,
+            }
+        )
+
+    @staticmethod
+    def _coarser(cells: int, most: int, fewest: int) -> int:
+        return max(fewest, min(most, round(cells / _COARSE_PIXELS)))
 
     @property
     def carriers(self) -> CarrierSettings:

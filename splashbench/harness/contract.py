@@ -112,6 +112,23 @@ class Run:
             self.stages[name] = self.stages.get(name, 0.0) + seconds - self._inner_seconds
             self._inner_seconds = around + seconds
 
+    def aside(self, span: tuple[float, float] | None = None) -> Run:
+        """A run of the same seed and device for a part of the fit of which nothing is recorded: no stages, notes,
+        decisions, nor anything that is taken over. It has neither budget nor checkpoints.
+
+        span: the part of this run's progress that it takes up; None where nobody is told of it.
+        """
+        if span is None:
+            return Run(seed=self.seed, device=self.device, directory=self.directory)
+        start, end = span
+        report = self.progress
+        return Run(
+            seed=self.seed,
+            device=self.device,
+            directory=self.directory,
+            _report=lambda done, message: report(start + (end - start) * done, message),
+        )
+
     def _checkpoint_seconds(self) -> float:
         return 0.0 if self._checkpoints is None else self._checkpoints.spent
 

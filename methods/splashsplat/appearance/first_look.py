@@ -35,6 +35,8 @@ _COLOR, _CERTAINTY = 3, 3
 _PASSING = 6
 #: features and hidden units of a decoder that a look fits into
 LEAST_FEATURES, LEAST_HIDDEN = _CERTAINTY + 1, _PASSING
+#: features that a look sets
+GIVEN = _CERTAINTY + 1
 # The other units' say at the start, as a share of what they would have.
 _NOISE = 0.1
 # No carrier is hidden.
@@ -126,6 +128,13 @@ def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
     return Look(colors.astype(np.float32), np.sqrt(variance).astype(np.float32))
 
 
+def features_of(look: Look) -> torch.Tensor:
+    """The first features of carriers that look like that: the logits of their colours, and what opacities lose by
+    doubt; float32 [count, `GIVEN`]."""
+    colors = torch.logit(torch.from_numpy(look.colors).clamp(_LEAST, 1 - _LEAST))
+    return torch.cat([colors, torch.from_numpy(-_DOUBT * look.spread)[:, None]], dim=1)
+
+
 @torch.no_grad()
 def take_on(look: Look, features: torch.Tensor, decoder: Decoder) -> None:
     """Have the first features of each carrier be the logits of its colour and what opacity loses by doubt, and
@@ -133,13 +142,11 @@ def take_on(look: Look, features: torch.Tensor, decoder: Decoder) -> None:
 
     features: float32 [count, size]. It takes `LEAST_FEATURES` of these, and `LEAST_HIDDEN` units of the colour head.
     """
-    features[:, :_COLOR] = torch.logit(torch.from_numpy(look.colors).clamp(_LEAST, 1 - _LEAST))
-    features[:, _CERTAINTY] = torch.from_numpy(-_DOUBT * look.spread)
-    given = _CERTAINTY + 1
+    features[:, :GIVEN] = features_of(look)
     hidden, out = decoder.color_hidden, decoder.color_out
     hidden.weight[:_PASSING] = 0
     hidden.bias[:_PASSING] = 0
-    hidden.weight[_PASSING:, :given] = 0
+    hidden.weight[_PASSING:, :GIVEN] = 0
     out.weight[:, :_PASSING] = 0
     out.weight[:, _PASSING:] *= _NOISE
     out.bias.zero_()
@@ -149,5 +156,5 @@ def take_on(look: Look, features: torch.Tensor, decoder: Decoder) -> None:
             out.weight[channel::3, unit] = sign
     # What the other heads would make of these features is noise, too.
     for head in (decoder.offset, decoder.scale, decoder.opacity):
-        head.weight[:, :given] = 0
+        head.weight[:, :GIVEN] = 0
     decoder.opacity.weight[:, _CERTAINTY] = 1

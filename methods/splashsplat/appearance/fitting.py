@@ -62,13 +62,16 @@ _PRUNINGS = tuple(tenth / 10 for tenth in range(1, 9))
 # When it is looked at anew what makes up each photograph, likewise; and not before each was seen so many times: until
 # then opacities say little.
 _FOCUSINGS, _SEEN_BEFORE = (0.2, 0.4, 0.6, 0.8), 4
-# The same with `idle_early`.
-_EARLY_FOCUSINGS, _SEEN_BEFORE_EARLY = (0.1, *_FOCUSINGS), 1
+# With `idle_early` so much after the beginning as well, and once each was seen so many times.
+_EARLY_FOCUSING, _SEEN_BEFORE_EARLY = 0.1, 1
 # After so many iterations, and after each that drew so many pixels, what the heap holds of freed images is given back.
 _GIVE_BACK_EVERY, _GIVE_BACK_PIXELS = 25, 1 << 20
 # Share of the photographs that were seen before a state is shown. On opaque_bowl it is better than the draft then, in
 # glass it is a decibel below for some seconds.
 _SHOWN_FROM = 0.25
+# The same of a fit that goes on from coarse grids, whose last state is better than the first ones on others. (Losses of
+# both say little, as plates lay behind the coarse ones: to wait for a smaller one took glass_tank a minute more.)
+_SHOWN_AGAIN_FROM = 1.25
 
 
 @dataclass(frozen=True)
@@ -81,15 +84,17 @@ class FitSettings:
     `AdaptiveSchedule`. price: see `EarningSchedule`, which is taken where it is above 0. prune_opacity: carriers whose
     learned opacity is below this at one of `_PRUNINGS` are not fitted any further; 0 fits all to the end. idle_share:
     carriers that together make up no more of a photograph than this are not fitted to it; which they are is looked at
-    at `_FOCUSINGS`. idle_early: at `_EARLY_FOCUSINGS` instead, and once each photograph was seen a single time.
+    at `_FOCUSINGS`. idle_early: at `_EARLY_FOCUSING` as well, and once each photograph was seen a single time.
     feature_cells, still_cell: see `SharedFeatures`; learning_rate_cells is that of the shared parts. coarse_share: of
     the iterations, the first ones, that see targets at half their size where these have one; coarsest_share: of all,
     the first ones, that see them at a quarter. plates_share: of the iterations, the first ones, for which the
     background is not needed yet. measured_share: of the iterations, the last ones, in which it is measured how much
-    photographs change with what is learned.
+    photographs change with what is learned. begun: of the iterations, the first ones, that another fit has made
+    (warm_start.py), where the schedule is fixed.
     """
 
     iterations: int = 1000
+    begun: int = 0
     validation_share: float = 0.0
     stop_gain: float = 0.01
     price: float = 0.0
@@ -163,10 +168,11 @@ class Fit:
 
 
 class _Moments:
-    """Shares of the fit at which something is due: of `iterations`, or of what the schedule says is done."""
+    """Shares of the fit at which something is due: of `iterations`, the first `begun` of which were made elsewhere, or
+    of what the schedule says is done."""
 
-    def __init__(self, shares: Sequence[float], iterations: int, by_schedule: bool) -> None:
-        self._iterations = {round(share * iterations) for share in shares}
+    def __init__(self, shares: Sequence[float], iterations: int, begun: int, by_schedule: bool) -> None:
+        self._iterations = {round(share * iterations) - begun for share in shares}
         self._left = sorted(shares) if by_schedule else None
 
     def come(self, iteration: int, schedule: Schedule) -> bool:
@@ -243,7 +249,7 @@ def fit_appearance(
 ) -> Fit:
     """Fit `appearance` in place. `color_cell`: in transport voxels.
 
-    offer: is given, after every iteration once each photograph was seen, what makes the appearance as it is, but for
+    offer: is given, after every iteration once some photographs were seen, what makes the appearance as it is, but for
     heads that are means over the last steps, and the carriers still fitted: bool [count]; and whether there will be no
     other for a while. settle: is called once, after the share `plates_share`, to put the background behind `targets`.
     clock: where given, the fit ends when it has run out, and `iterations` are the most that there are. device: where it
@@ -274,7 +280,7 @@ def fit_appearance(
     size = look.features.shape[1] + look.log_scales.shape[1]
     measured = Sensitivities(track.carriers.count, size, device) if settings.measured_share > 0 else None
     withheld_targets = np.zeros(len(targets), dtype=bool)
-    schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal)
+    schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal, settings.begun)
     if clock is not None:
         schedule = TimedSchedule(settings.iterations, clock)
     elif settings.validation_share > 0:
@@ -374,9 +380,14 @@ def fit_appearance(
         return target
 
     reader = ReadAhead()
-    looks, seen_before = (_EARLY_FOCUSINGS, _SEEN_BEFORE_EARLY) if settings.idle_early else (_FOCUSINGS, _SEEN_BEFORE)
-    prunings, focusings = (_Moments(shares, settings.iterations, clock is not None) for shares in (_PRUNINGS, looks))
-    shown_from = round(_SHOWN_FROM * len(targets))
+    begun = settings.begun / max(settings.iterations, 1)
+    # What is transparent by what was handed on is left out at once; idle carriers are not looked for by that alone.
+    early, seen_before = ([begun + _EARLY_FOCUSING], _SEEN_BEFORE_EARLY) if settings.idle_early else ([], _SEEN_BEFORE)
+    looks = [*early, *(share for share in _FOCUSINGS if round(share * settings.iterations) > settings.begun)]
+    prunings, focusings = (
+        _Moments(shares, settings.iterations, settings.begun, clock is not None) for shares in (_PRUNINGS, looks)
+    )
+    shown_from = round((_SHOWN_FROM if settings.begun == 0 else _SHOWN_AGAIN_FROM) * len(targets))
     queue: list[int] = []
     history: list[float] = []
     iteration = 0
@@ -402,7 +413,11 @@ def fit_appearance(
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
             carriers.drop((decoder.mean_opacity(features.all()).detach() < settings.prune_opacity).cpu())
             features.keep(carriers.ids)
-        if settings.idle_share > 0 and focusings.come(iteration, schedule) and iteration >= seen_before * len(targets):
+        if (
+            settings.idle_share > 0
+            and focusings.come(iteration, schedule)
+            and settings.begun + iteration >= seen_before * len(targets)
+        ):
             carriers.focus(idle, targets)
             features.keep(carriers.ids)
         target = targets[queue.pop()]
@@ -445,7 +460,7 @@ def fit_appearance(
         iteration += 1
         if iteration % _GIVE_BACK_EVERY == 0 or alpha.numel() >= _GIVE_BACK_PIXELS:
             memory.give_back()
-        progress(schedule.done(iteration))
+        progress((schedule.done(iteration) - begun) / (1 - begun))
         if offer is not None and iteration >= shown_from:
             offer(state, False)
     reader.close()

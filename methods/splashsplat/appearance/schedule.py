@@ -56,10 +56,11 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class FixedSchedule:
-    """`iterations`, at constant rates or down a half cosine."""
+    """`iterations`, at constant rates or down a half cosine, of which another fit made the first `begun`."""
 
     iterations: int
     anneal: bool
+    begun: int = 0
 
     @property
     def withholds(self) -> bool:
@@ -72,12 +73,12 @@ class FixedSchedule:
         raise AssertionError("a fixed schedule looks at nothing")
 
     def factor(self, iteration: int) -> float | None:
-        if iteration >= self.iterations:
+        if self.begun + iteration >= self.iterations:
             return None
-        return _cosine(iteration / self.iterations) if self.anneal else 1.0
+        return _cosine(self.done(iteration)) if self.anneal else 1.0
 
     def done(self, iteration: int) -> float:
-        return iteration / self.iterations
+        return (self.begun + iteration) / self.iterations
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ sys.path.insert(0, str(Path(__file__).parents[2]))  # for the module in tests/
 from virtual_device import DEVICE, VirtualTensor, virtual_device
 
 from splashbench.gaussians.torch_threads import one_torch_thread
+from splashbench.harness import side_by_side
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Run
-from splashbench.native.threads import use_threads
 from splashbench.render import autograd, backends
 from splashbench.scene import Scene
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method
 from splashbench_methods.splashsplat import settings as settings_module
 from splashbench_methods.splashsplat.appearance import fitting, losses
 from splashbench_methods.splashsplat.appearance.compositing import composite
@@ -86,8 +86,9 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         return original(name, means)
 
     monkeypatch.setattr(backends, "backend_for", backend_for)
-    # One thread: the device is the thread's own.
-    with virtual_device() as name, use_threads(1), one_torch_thread():
+    for module in (method, side_by_side):
+        monkeypatch.setattr(module, "thread_count", lambda: 1)  # the device is the thread's own
+    with virtual_device() as name, one_torch_thread():
         yield name
 
 
@@ -116,9 +117,17 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_fit_there_is_the_cpus(
-    case: str, balls: Scene, device: str, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    case: str,
+    balls: Scene,
+    device: str,
+    short_background: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
     preset, settings = CASES[case]
+    if case in ("glass", "auto"):
+        request.getfixturevalue("flat_background")
     monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
     monkeypatch.setattr(fitting, "_LOOK_EVERY", 20)
     monkeypatch.setattr(fitting, "_BEFORE", 30)

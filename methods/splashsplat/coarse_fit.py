@@ -1,0 +1,65 @@
+"""The first part of the fit, on coarse grids. Not in the paper.
+
+A trace on fine grids takes as long as this whole part. It shows most of the liquid within half a minute, and what it
+learned is what the carriers of the fine grids begin with (appearance/warm_start.py). They go on with its schedule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from splashbench.harness.contract import Run
+from splashbench.scene.scene import TrainingScene
+
+from .appearance.warm_start import Learned
+from .fields.container import KnownContainer
+from .reconstruction import Reconstruction, fit_liquid, trace_liquid
+from .settings import SplashSplatConfig
+
+# Share of it that the trace takes, for the progress bar only.
+_TRACE = 0.4
+
+
+@dataclass(frozen=True)
+class CoarseFit:
+    """What was learned, in a list to be taken out of, and what it looks like."""
+
+    learned: list[Learned]
+    reconstruction: Reconstruction
+
+
+def begins_on_coarse_grids(config: SplashSplatConfig, run: Run) -> bool:
+    """Whether the fit by `config` has such a part: with a fixed schedule, without a budget, and where plates stand for
+    the background at first."""
+    plates = config.plates_share > 0 and config.composition != "together"
+    fixed = config.validation_share == 0 and not run.budget.limits
+    return plates and fixed and config.coarse_iterations > 0
+
+
+def fit_coarsely(
+    scene: TrainingScene,
+    config: SplashSplatConfig,
+    run: Run,
+    known: KnownContainer | None,
+    plates: dict[str, np.ndarray],
+    offer: Callable[[Callable[[], Reconstruction], bool], None] | None,
+    span: tuple[float, float],
+) -> CoarseFit | None:
+    """The first iterations by `config`, on coarse grids; None where these show nothing that a photograph could teach.
+
+    known: see `observe`. plates: float32 [H, W, 3] of every training view, what lies behind the liquid. offer: see
+    `fit_liquid`. span: the part of `run`'s progress this takes up.
+    """
+    middle = span[0] + _TRACE * (span[1] - span[0])
+    # What the observations say is noted by the fine ones.
+    traced = trace_liquid(scene, config.coarse(), run.aside((span[0], middle)), known)
+    learned: list[Learned] = []
+    found = fit_liquid(scene, plates, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)
+    if not learned:
+        return None
+    if offer is not None:
+        offer(lambda: found, True)
+    return CoarseFit(learned, found)

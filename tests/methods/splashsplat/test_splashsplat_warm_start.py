@@ -1,0 +1,260 @@
+"""A fit that begins with what was learned on coarser grids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from splashbench.harness import side_by_side
+from splashbench.harness.checkpoints import Checkpoints
+from splashbench.harness.contract import Budget, Fitted, Run
+from splashbench.observe.grid import Grid
+from splashbench.scene import Scene, TrainingScene
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method, reconstruction
+from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, initial_log_scale
+from splashbench_methods.splashsplat.appearance.first_look import Look, features_of
+from splashbench_methods.splashsplat.appearance.fitting import Appearance, Fit, FitSettings, initial_appearance
+from splashbench_methods.splashsplat.appearance.glass import Glass
+from splashbench_methods.splashsplat.appearance.schedule import FixedSchedule
+from splashbench_methods.splashsplat.appearance.warm_start import Learned, hand_on, nearest_carriers
+from splashbench_methods.splashsplat.carriers.population import Carriers
+from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.coarse_fit import CoarseFit
+from splashbench_methods.splashsplat.motion.steps import Motion
+
+BASE_SCALE = 0.5
+SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 6, "velocity_steps": 2, "self_calibration": False}
+
+
+def track(frames: list[list[tuple[int, float]]], voxel: float, origin: float = 0.0) -> Track:
+    """Carriers by frame, each a number and an x in scene units, on a grid of that voxel."""
+    starts = np.cumsum([0, *(len(frame) for frame in frames)])
+    ids = np.array([number for frame in frames for number, _ in frame], dtype=np.int32)
+    x = np.array([place for frame in frames for _, place in frame], dtype=np.float64)
+    positions = np.zeros((len(ids), 3), dtype=np.float32)
+    positions[:, 0] = (x - origin) / voxel
+    carriers = Carriers(
+        starts,
+        ids,
+        positions,
+        np.tile(np.eye(3, dtype=np.float32), (len(ids), 1, 1)),
+        np.zeros(len(ids), dtype=np.float32),
+        int(ids.max(initial=-1)) + 1,
+    )
+    grid = Grid(np.array([origin, 0.0, 0.0]), voxel, (12, 12, 12))
+    shape = (len(frames), 12, 12, 12)
+    return Track(grid, carriers, Motion(np.zeros((0, 7, 7, 7, 3), np.float32), 2, []), np.zeros(shape, np.int8))
+
+
+COARSE = track([[(0, 0.0), (1, 2.0)], [], [(1, 2.4), (2, 0.4)]], voxel=0.5, origin=-1.0)
+FINE = track([[(0, 0.1), (1, 1.9)], [(0, 0.2), (2, 1.1)], [(3, 2.3), (4, 0.3)]], voxel=0.25)
+
+
+def test_each_takes_the_nearest_one_of_the_frame_of_its_birth() -> None:
+    # Number 2 is born in a frame in which the coarse fit has none: the one before counts.
+    assert nearest_carriers(COARSE, FINE).tolist() == [0, 1, 1, 1, 2]
+
+
+def test_without_coarse_carriers_there_is_none_to_take() -> None:
+    assert nearest_carriers(track([[], [], []], voxel=0.5), FINE).tolist() == [-1] * 5
+
+
+def look(count: int, seed: int) -> Look:
+    rng = np.random.default_rng(seed)
+    return Look(rng.uniform(0.2, 0.8, (count, 3)).astype(np.float32), rng.uniform(0, 0.1, count).astype(np.float32))
+
+
+def appearance(of: Track, seed: int) -> Appearance:
+    decoder = DecoderSettings(feature_size=8, children=1, color_width=8)
+    made = initial_appearance(of.carriers.count, of.grid.voxel, FitSettings(base_scale=BASE_SCALE), decoder, seed)
+    made.features = torch.randn(made.features.shape, generator=torch.Generator().manual_seed(seed))
+    return made
+
+
+def learned() -> Learned:
+    found = appearance(COARSE, 1)
+    found.log_scales += torch.tensor([[0.0], [0.3], [-0.2]])
+    found.glass = Glass(*(torch.rand(shape) for shape in ((2, 3), (2, 3), (2, 4), (2,), (2, 3), (2, 3, 3))))
+    return Learned(COARSE, found, look(3, 1))
+
+
+def test_features_extents_heads_and_glass_are_handed_on() -> None:
+    given, taken = learned(), appearance(FINE, 2)
+    hand_on(given, FINE, None, taken, BASE_SCALE)
+    rows = [0, 1, 1, 1, 2]
+    assert torch.equal(taken.features, given.appearance.features[rows])
+    grown = torch.tensor([0.0, 0.3, 0.3, 0.3, -0.2])[:, None].expand(5, 3)
+    torch.testing.assert_close(taken.log_scales - initial_log_scale(BASE_SCALE, 0.25), grown)
+    theirs, ours = given.appearance.decoder.state_dict(), taken.decoder.state_dict()
+    for name in theirs.keys() - {"opacity.bias"}:
+        assert torch.equal(ours[name], theirs[name])
+    # Twice as many lie one behind the other.
+    torch.testing.assert_close(ours["opacity.bias"], theirs["opacity.bias"] - math.log(2))
+    assert given.appearance.glass is not None
+    assert taken.glass is not None
+    assert torch.equal(taken.glass.positions, given.appearance.glass.positions)
+    taken.glass.positions += 1  # its own
+    assert not torch.equal(taken.glass.positions, given.appearance.glass.positions)
+
+
+def test_what_photographs_show_of_them_otherwise_is_added() -> None:
+    given, taken, shown = learned(), appearance(FINE, 2), look(5, 3)
+    assert given.look is not None
+    hand_on(given, FINE, shown, taken, BASE_SCALE)
+    rows, changed = [0, 1, 1, 1, 2], features_of(shown) - features_of(given.look)[[0, 1, 1, 1, 2]]
+    torch.testing.assert_close(taken.features[:, :4], given.appearance.features[rows][:, :4] + changed)
+    assert torch.equal(taken.features[:, 4:], given.appearance.features[rows][:, 4:])
+
+
+def test_a_schedule_goes_on_where_another_fit_ended() -> None:
+    whole, rest = FixedSchedule(100, anneal=True), FixedSchedule(100, anneal=True, begun=30)
+    assert [rest.factor(i) for i in range(71)] == [whole.factor(i) for i in range(30, 101)]
+    assert rest.factor(70) is None
+    assert rest.done(20) == whole.done(50)
+
+
+def error(fitted: Fitted, scene: Scene) -> float:
+    camera = scene.cameras["6"]
+    return float(
+        np.mean([
+            np.square(fitted.render(camera, float(scene.times[t])).rgb - scene.image("6", t) / 255).mean()
+            for t in range(scene.n_frames)
+        ])
+    )  # fmt: skip
+
+
+def fitted(scene: Scene, run: Run | None = None, **settings: Any) -> Fitted:
+    config = SplashSplatConfig.preset("best", SMALL | {"background_preset": "quick"} | settings)
+    return SplashSplat().fit(scene.training(), config, run or Run())
+
+
+@pytest.fixture
+def coarse_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many iterations each coarse fit has had."""
+    made: list[int] = []
+    original = method.fit_coarsely
+
+    def fit_coarsely(scene: TrainingScene, config: SplashSplatConfig, *others: Any) -> CoarseFit:
+        made.append(config.coarse_iterations)
+        return original(scene, config, *others)
+
+    monkeypatch.setattr(method, "fit_coarsely", fit_coarsely)
+    return made
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> dict[float, int]:
+    """How many iterations were made on grids of so large transport voxels (scene units)."""
+    made: dict[float, int] = {}
+    original = reconstruction.fit_appearance
+
+    def fit_appearance(look: Any, track: Track, *others: Any) -> Fit:
+        fit = original(look, track, *others)
+        made[track.grid.voxel] = made.get(track.grid.voxel, 0) + len(fit.losses)
+        return fit
+
+    monkeypatch.setattr(reconstruction, "fit_appearance", fit_appearance)
+    return made
+
+
+def test_the_first_iterations_are_made_on_coarse_grids(
+    balls: Scene, flat_background: None, coarse_fits: list[int], steps: dict[float, int]
+) -> None:
+    with_it = fitted(balls, iterations=100, coarse_grids_share=0.4)
+    assert coarse_fits == [40]
+    fine, coarse = sorted(steps)
+    assert coarse > 1.4 * fine
+    assert steps == {coarse: 40, fine: 60}
+    # Sixty steps of a hundred, alone: the rates are as high, but nothing was learned before.
+    steps.clear()
+    without = fitted(balls, iterations=60, coarse_grids_share=0.0)
+    assert steps == {fine: 60}
+    assert error(with_it, balls) < error(without, balls)
+
+
+def on_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Parts of a fit are made on so many cores."""
+    for module in (method, side_by_side):
+        monkeypatch.setattr(module, "thread_count", lambda: count)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_who_looks_on_changes_nothing(
+    balls: Scene, flat_background: None, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_cores(monkeypatch, threads)
+    images = []
+    for watched in (False, True):
+        run = Run()
+        if watched:
+            run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
+        found = fitted(balls, run, iterations=40, draft_cells=0)
+        images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
+    np.testing.assert_array_equal(*images)
+
+
+def test_what_is_shown_on_one_core(
+    balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coarse fit as it goes and at its end, the same before the background, and the fine one."""
+    shown: list[tuple[int, bool]] = []
+    run = Run()
+    run._checkpoints = Checkpoints(tmp_path, [1e9], lambda: 7.0, lambda: None)
+
+    def offer(state: Callable[[], Fitted], milestone: bool) -> None:
+        if milestone:
+            model = state()
+            assert isinstance(model, method.FittedSplashSplat)
+            shown.append((model.liquid.carriers.count, len(model.background.model) > 0))
+
+    monkeypatch.setattr(run._checkpoints, "offer", offer)
+    on_cores(monkeypatch, 1)
+    fitted(balls, run, iterations=40, draft_cells=0)
+    (first, before), (second, behind) = shown
+    assert (before, behind) == (False, True)
+    assert first == second
+
+
+def test_where_the_coarse_fit_learns_nothing_there_is_none(
+    balls: Scene, flat_background: None, steps: dict[float, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(method, "fit_coarsely", lambda *_: None)
+    fitted(balls, iterations=10)
+    assert list(steps.values()) == [10]
+
+
+def test_a_run_aside_leaves_no_record(tmp_path: Path) -> None:
+    told: list[tuple[float, str]] = []
+    run = Run(seed=3, device="cuda", directory=tmp_path, budget=Budget(seconds=5.0))
+    run._report = lambda done, message: told.append((done, message))
+    part = run.aside((0.2, 0.6))
+    assert (part.seed, part.device, part.directory, part.budget.limits) == (3, "cuda", tmp_path, {})
+    part.progress(0.5, "half")
+    part.note("name", "text")
+    with part.stage("stage"):
+        run.aside().progress(0.9, "nobody is told")
+    assert told == [(pytest.approx(0.4), "half")]
+    assert not run.notes
+    assert not run.stages
+
+
+@pytest.mark.parametrize(
+    ("settings", "budget"),
+    [
+        ({"validation_share": 0.04}, Budget()),
+        ({"plates_share": 0.0}, Budget()),
+        ({}, Budget(seconds=60.0)),
+        ({"coarse_grids_share": 0.0}, Budget()),
+    ],
+)
+def test_there_is_none_where_something_else_ends_the_fit(
+    settings: dict[str, Any], budget: Budget, balls: Scene, flat_background: None, coarse_fits: list[int]
+) -> None:
+    fitted(balls, Run(budget=budget), iterations=12, **settings)
+    assert coarse_fits == []
