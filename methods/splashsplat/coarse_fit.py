@@ -1,7 +1,7 @@
 """The first part of the fit, on coarse grids. Not in the paper.
 
-A trace on fine grids takes as long as this whole part. It shows most of the liquid within half a minute, and what it
-learned is what the carriers of the fine grids begin with (appearance/warm_start.py). They go on with its schedule.
+A trace on fine grids takes about as long as this whole part, and has nothing to show. What is learned here is what the
+carriers of the fine grids begin with (appearance/warm_start.py). They go on with its schedule.
 """
 
 from __future__ import annotations

@@ -105,12 +105,15 @@ def _fitted(scene: Scene, device: str, preset: str, settings: dict[str, Any], ch
     return fitted
 
 
+# Steps of what is stored are chosen by trials, and another step shows in renders more than sums in another order do.
+ALONE = {"draft_cells": 0, "storage_tolerance": 0.0}
+
 #: Settings that between them reach every part of a fit.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "best": ("best", {"draft_cells": 24}),
-    "glass": ("best", {"glass": 100, "beside_weight": 0.5, "draft_cells": 0, "clear_idle_early": True}),
-    "coarse first": ("quick", {"coarse_share": 0.4, "coarsest_share": 0.2, "coarse_side": 1, "draft_cells": 0}),
-    "auto": ("auto", {"draft_cells": 0, "iterations": 120}),
+    "glass": ("best", ALONE | {"glass": 100, "beside_weight": 0.5, "clear_idle_early": True}),
+    "coarse first": ("quick", ALONE | {"coarse_share": 0.4, "coarsest_share": 0.2, "coarse_side": 1}),
+    "auto": ("auto", ALONE | {"iterations": 120}),
     "paper": ("paper", {"children": 2, "draft_cells": 0}),
 }
 
@@ -126,7 +129,7 @@ def test_a_fit_there_is_the_cpus(
     request: pytest.FixtureRequest,
 ) -> None:
     preset, settings = CASES[case]
-    if case in ("glass", "auto"):
+    if case not in ("best", "paper"):  # these look at it, and draw its Gaussians with the liquid's
         request.getfixturevalue("flat_background")
     monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
     monkeypatch.setattr(fitting, "_LOOK_EVERY", 20)
@@ -136,8 +139,8 @@ def test_a_fit_there_is_the_cpus(
     expected = _images(_fitted(balls, "cpu", preset, settings, tmp_path / "cpu"), balls)
     fitted = _fitted(balls, device, preset, settings, tmp_path / "device")
     images = _images(fitted, balls)
-    # Sums in another order end in another fit, a little; what was chosen by a look at withheld photographs, in more.
-    assert np.quantile(np.abs(images - expected), 0.99) < (0.01 if case == "auto" else 1e-3)
+    # Sums in another order end in another fit, a little.
+    assert np.quantile(np.abs(images - expected), 0.99) < 1e-3
     fitted.to_device(device)
     assert np.abs(_images(fitted, balls) - images).max() < 1e-5
     assert fitted.gaussians(float(balls.times[2]), balls.cameras["6"].center) is not None
