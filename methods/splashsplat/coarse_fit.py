@@ -7,7 +7,6 @@ carriers of the fine grids begin with (appearance/warm_start.py). They go on wit
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,14 +22,6 @@ from .settings import SplashSplatConfig
 _TRACE = 0.4
 
 
-@dataclass(frozen=True)
-class CoarseFit:
-    """What was learned, in a list to be taken out of, and what it looks like."""
-
-    learned: list[Learned]
-    reconstruction: Reconstruction
-
-
 def begins_on_coarse_grids(config: SplashSplatConfig, run: Run) -> bool:
     """Whether the fit by `config` has such a part: with a fixed schedule, without a budget, and where plates stand for
     the background at first."""
@@ -44,22 +35,21 @@ def fit_coarsely(
     config: SplashSplatConfig,
     run: Run,
     known: KnownContainer | None,
-    plates: dict[str, np.ndarray],
+    behind: dict[str, np.ndarray],
     offer: Callable[[Callable[[], Reconstruction], bool], None] | None,
     span: tuple[float, float],
-) -> CoarseFit | None:
-    """The first iterations by `config`, on coarse grids; None where these show nothing that a photograph could teach.
+) -> list[Learned]:
+    """What the first iterations by `config` teach, on coarse grids, to be taken out of the list, as it is large. It is
+    empty where these grids show nothing that a photograph could teach.
 
-    known: see `observe`. plates: float32 [H, W, 3] of every training view, what lies behind the liquid. offer: see
+    known: see `observe`. behind: float32 [H, W, 3] of every training view, what lies behind the liquid. offer: see
     `fit_liquid`. span: the part of `run`'s progress this takes up.
     """
     middle = span[0] + _TRACE * (span[1] - span[0])
     # What the observations say is noted by the fine ones.
     traced = trace_liquid(scene, config.coarse(), run.aside((span[0], middle)), known)
     learned: list[Learned] = []
-    found = fit_liquid(scene, plates, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)
-    if not learned:
-        return None
-    if offer is not None:
+    found = fit_liquid(scene, behind, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)
+    if learned and offer is not None:
         offer(lambda: found, True)
-    return CoarseFit(learned, found)
+    return learned

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _ITERATIONS, _ANCHORS, _LONGEST_SIDE = 80, 5000, 160
 
 #: The liquid, what lies behind it, and what hides the liquid from cameras.
-Draft = tuple[Liquid, "Background", LiquidOcclusion | None]
+State = tuple[Liquid, "Background", LiquidOcclusion | None]
 
 
 def make_draft(
@@ -37,9 +37,9 @@ def make_draft(
     run: Run,
     known: KnownContainer,
     plates: Callable[[], Plates],
-    offer: Callable[[Callable[[], Draft], bool], None],
-) -> Background:
-    """Fit a draft of `scene`; returns its background.
+    offer: Callable[[Callable[[], State], bool], None],
+) -> State:
+    """Fit a draft of `scene`; returns it.
 
     config: that of the fit. run: see `Run.aside`. plates: gives what the training views show without the liquid. offer:
     is given what makes the draft as it is, and whether there will be no other for a while; at the end, too.
@@ -61,11 +61,11 @@ def make_draft(
     def offer_state(state: Callable[[], Reconstruction], milestone: bool) -> None:
         offer(lambda: complete(state()), milestone)
 
-    def complete(found: Reconstruction) -> Draft:
+    def complete(found: Reconstruction) -> State:
         liquid, occlusion = found
         return liquid, background, occlusion
 
     traced = trace_liquid(scene, coarse, run, known)
     found = fit_liquid(scene, completed(first, background), traced, run, offer=offer_state, settled=settled)
     offer(lambda: complete(found), True)
-    return background
+    return complete(found)

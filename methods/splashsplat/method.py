@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -14,7 +13,6 @@ import torch
 from splashbench.gaussians.devices import CPU, GaussianMethod
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Render, Run, Support
-from splashbench.parallel import thread_count
 from splashbench.render import Frozen, freeze
 from splashbench.scene.camera import Camera
 from splashbench.scene.gaussians import Gaussians
@@ -22,30 +20,22 @@ from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.particles import Particles
 from splashbench.scene.scene import TrainingScene
 from splashbench.scene.velocity import VelocityField
-from splashbench.selfcalibration import self_calibration
 
-from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
 from .appearance.compositing import composite
 from .appearance.decoder import Children
-from .appearance.warm_start import Learned
 from .carriers.between import carriers_at
 from .carriers.subframe import CarrierState
-from .coarse_fit import CoarseFit, begins_on_coarse_grids, fit_coarsely
-from .draft import make_draft
-from .fields.container import known_container
+from .course import Course
+from .draft import State
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import metric_gravity
 from .model import Liquid
-from .reconstruction import Reconstruction, Traced, fit_liquid, trace_liquid
 from .settings import VERSION, SplashSplatConfig
 
 if TYPE_CHECKING:
     from ..scaffold_gs import Background
 
 MIN_VIEWS = 2
-# Shares of the time that the fit on coarse grids takes, and everything else before the appearance, for the progress bar
-# only.
-_COARSE, _BEFORE = 0.2, 0.35
 
 
 class FittedSplashSplat(Fitted):
@@ -209,121 +199,14 @@ class SplashSplat(GaussianMethod):
         return Support(True)
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
-        """Observation fields and carriers, then the appearance, whose first iterations need no background yet.
-
-        Where there are cores, the background is fitted beside the carriers, and else once it is needed.
-        """
-        from ..scaffold_gs import clean_plates, completed, flat_background, shared_background
-
+        """The parts of the fit, in the order of course.py."""
         if config.variant == "flip":
             metric_gravity(scene)  # an error now rather than after the background
 
-        def fit_background(part: Run) -> Background:
-            with part.stage("background"), one_torch_thread():
-                return shared_background(scene, settings, part)
+        def show(state: Callable[[], State], milestone: bool) -> None:
+            run.checkpoint(lambda: FittedSplashSplat(*state()), milestone)
 
-        plates = cache(lambda: clean_plates(scene))
-        known, drafted = None, None
-        if run.watched and config.draft_cells > 0:
-            run.progress(0, "draft")
-            with run.stage("draft"):
-                known = known_container(scene, config.container, config.container_masks)
-                drafted = make_draft(
-                    scene,
-                    config,
-                    run.aside(),
-                    known,
-                    plates,
-                    lambda state, milestone: run.checkpoint(lambda: FittedSplashSplat(*state()), milestone),
-                )
-        if config.self_calibration and affords_self_calibration(run):
-            with run.stage("self-calibration"):
-                calibration = self_calibration(scene, plates, lambda what: run.progress(0, what))
-            if calibration:
-                run.note("self-calibration", "; ".join(calibration.lines(scene.cameras)))
-                scene, known = calibration.scene(scene), None
-                plates = cache(lambda: clean_plates(scene))
-        deferred = config.plates_share > 0 and config.composition != "together"
-        behind: dict[str, np.ndarray]
-        frozen: dict[str, Frozen] | None = None
-        settled: Callable[[], dict[str, np.ndarray]] | None = None
-        if deferred:
-            with run.stage("background"):
-                background = flat_background(plates())
-                behind = completed(plates(), background)
-            # What is shown on the way; the liquid is fitted before the plates, whether there was a draft or not.
-            background = drafted or background
-        # Every trace on the way to the one that is kept asks for it.
-        if known is None and (run.budget.limits or begins_on_coarse_grids(config, run)):
-            known = known_container(scene, config.container, config.container_masks)
-        spent = within_seconds(scene, config, run, known)
-        config, settings = spent.config, config.background.model_copy(update=background_update(config, run))
-
-        def offer(state: Callable[[], Reconstruction], milestone: bool) -> None:
-            run.checkpoint(lambda: FittedSplashSplat(*with_background(*state())), milestone)
-
-        def with_background(
-            liquid: Liquid, occlusion: LiquidOcclusion | None
-        ) -> tuple[Liquid, Background, LiquidOcclusion | None]:
-            return liquid, background, occlusion
-
-        watched = offer if run.watched else None
-        coarse: CoarseFit | None = None
-        learned: list[Learned] | None = None
-        start = _BEFORE
-        if begins_on_coarse_grids(config, run):
-            with run.stage("coarse fit"):
-                coarse = fit_coarsely(scene, config, run, known, behind, watched, (0, _COARSE))
-
-        def trace(part: Run) -> Traced:
-            return within_bytes(config, part, lambda coarser: trace_liquid(scene, coarser, part, known), spent.traced)
-
-        if coarse is not None:
-            # On one core the background comes before the trace: what is shown meanwhile gains by it.
-            shown = coarse.reconstruction if watched is not None and thread_count() == 1 else None
-
-            def fit_background_first(part: Run) -> Background:
-                nonlocal background
-                made = fit_background(part)
-                if watched is not None and shown is not None:
-                    background, before = made, shown
-                    watched(lambda: before, True)
-                return made
-
-            background, traced = run.side_by_side(fit_background_first, trace, span=(_COARSE, _COARSE + _BEFORE))
-            behind = background.seen_by(scene)
-            learned, start = coarse.learned, _COARSE + _BEFORE
-            coarse = shown = None  # large
-        else:
-            late, traced = run.ahead(fit_background, trace, span=(0, _BEFORE))
-            if config.composition == "together":
-                background = late()
-                behind = dict.fromkeys(scene.train, background.far_color)
-                frozen = {
-                    name: freeze(*background.gaussians(scene.cameras[name]), scene.cameras[name])
-                    for name in scene.train
-                }
-            elif not deferred:
-                background = late()
-                behind = background.seen_by(scene)
-            else:
-
-                def settled() -> dict[str, np.ndarray]:
-                    nonlocal background
-                    background = late()
-                    return background.seen_by(scene)
-
-        room = None
-        if run.budget.storage_bytes is not None:
-            limit = run.budget.storage_bytes
-
-            def room() -> int:
-                return limit - background.stored_bytes
-
-        found = fit_liquid(scene, behind, traced, run, (start, 1), frozen, watched, settled, room, learned)
-        if settled is not None:
-            background = late()  # a fit without any photograph asked for none
-        return FittedSplashSplat(*with_background(*found))
+        return FittedSplashSplat(*Course(scene, config, run, show).taken())
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""

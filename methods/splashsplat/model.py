@@ -31,7 +31,16 @@ from .motion.steps import Motion
 from .motion.velocity import Factor
 from .storage.earlier import EARLIER, read_earlier
 from .storage.looks import appearance_arrays, appearance_ranks, learned_values, read_appearance
-from .storage.track import CARRIERS, DEFORMATION, DISTANCE, MOTION, read_track, track_arrays
+from .storage.track import (
+    CARRIERS,
+    DEFORMATION,
+    DISTANCE,
+    MOTION,
+    carrier_arrays,
+    distance_arrays,
+    motion_arrays,
+    read_track,
+)
 
 T = TypeVar("T")
 
@@ -61,8 +70,8 @@ class Liquid:
     times: [T] seconds. grid: the transport grid. carriers, motion: in the precision of the files. phi: int8 [T, nx, ny,
     nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers. composition: how it was
     fitted and is drawn: "over" an image of the background, or "together" with the background's Gaussians.
-    between_frames: whose carriers are drawn there, see carriers/between.py. arrays: what is stored, by file and name;
-    none of a model of an earlier version.
+    between_frames: whose carriers are drawn there, see carriers/between.py. arrays: what is stored, by file and name,
+    but phi; none of a model of an earlier version.
     """
 
     times: np.ndarray
@@ -96,7 +105,8 @@ class Liquid:
         """
         known = Sensitivity.of_spread(learned_values(appearance)) if sensitivity is None else sensitivity
         arrays = {
-            **track_arrays(track, carried),
+            "carriers": carrier_arrays(track, track.carriers, carried),
+            "motion": motion_arrays(track.motion),
             "appearance": appearance_arrays(appearance, known, step, track.grid),
         }
         look = read_appearance(arrays["appearance"], Decoder(appearance.decoder.settings), track.grid)
@@ -177,7 +187,7 @@ class Liquid:
     @property
     def stored_bytes(self) -> int:
         """How much `save` writes, to within some kilobytes."""
-        return sum(compressed_bytes(arrays) for arrays in self.arrays.values())
+        return sum(compressed_bytes(self._stored(name)) for name in _FILES)
 
     def save(self, directory: Path) -> None:
         """Write liquid.json and four .npz files into `directory`."""
@@ -200,7 +210,11 @@ class Liquid:
         }
         write_json(directory / "liquid.json", header)
         for name in _FILES:
-            write_npz(directory / f"{name}.npz", self.arrays[name])
+            write_npz(directory / f"{name}.npz", self._stored(name))
+
+    def _stored(self, name: str) -> Mapping[str, np.ndarray]:
+        """What the file `name` holds."""
+        return distance_arrays(self.phi) if name == "distance" else self.arrays[name]
 
     @classmethod
     def load(cls, directory: Path) -> Liquid:
@@ -243,6 +257,7 @@ class Liquid:
                 others = f"{count} carriers, not {track.carriers.count}"
                 raise SplashbenchError(f"{directory / 'appearance.npz'} has {others}; {_AGAIN}")
             look = _fitting(directory / "appearance.npz", lambda: read_appearance(arrays["appearance"], decoder, grid))
+            del arrays["distance"]  # large, and phi again
         return cls._of_parts(times, track, look, carried, composition, between, arrays)
 
 

@@ -44,7 +44,7 @@ from .motion.steps import FrameStep, Motion
 from .motion.velocity import control_shape
 from .settings import SplashSplatConfig
 from .storage.signed_distance import reach
-from .storage.steps import Storage
+from .storage.steps import Storage, Stored
 from .storage.track import carrier_arrays, stored_track, track_arrays
 
 Report = Callable[[float, str], None]
@@ -167,6 +167,7 @@ def fit_liquid(
             run.device,
             learned,
         )
+    memory.forget()  # what comes has other sizes
     appearance = found.appearance
     if keep is not None and fit is not None:
         keep(found)
@@ -175,25 +176,43 @@ def fit_liquid(
     if fit is None:
         return reconstruction(appearance, np.ones(track.carriers.count, dtype=bool))
     left = shown(appearance, fit.left)
-    if fit.sensitivity is None:
+    sensitivity = fit.sensitivity
+    if sensitivity is None:
         return reconstruction(appearance, left)
     with run.stage("storing"), one_torch_thread():
         memory.give_back()
-        storage = Storage(appearance, left, fit, run.seed)
-        stored, decision = storage.within_tolerance(config.storage_tolerance)
-        run.decide(decision)
-        if room is not None:
-            arrays = track_arrays(track, config.carried)
-            fixed = _HEADER + sum(compressed_bytes(arrays[name]) for name in ("motion", "distance"))
+        taken = 0 if occlusion is None else occlusion.stored_bytes
+        stored = _within_tolerance(track, appearance, left, fit, config, run, None if room is None else room() - taken)
+        del fit, found  # large: the photographs, and what was known of all carriers
+        memory.forget()
+        return reconstruction(appearance, stored.kept, sensitivity, stored.step)
 
-            def other_bytes(kept: np.ndarray) -> int:
-                return fixed + compressed_bytes(carrier_arrays(track, track.carriers.keep(kept)[0], config.carried))
 
-            beside = _glass_bytes(appearance) + (0 if occlusion is None else occlusion.stored_bytes)
-            stored, spent = storage.within_room(room() - beside, stored, other_bytes)
-            if spent is not None:
-                run.decide(spent)
-        return reconstruction(appearance, stored.kept, fit.sensitivity, stored.step)
+def _within_tolerance(
+    track: Track,
+    appearance: Appearance,
+    left: np.ndarray,
+    fit: Fit,
+    config: SplashSplatConfig,
+    run: Run,
+    room: int | None,
+) -> Stored:
+    """How the carriers `left` (bool [count]) are stored. room: where given, the bytes that the liquid may take."""
+    storage = Storage(appearance, left, fit, run.seed)
+    stored, decision = storage.within_tolerance(config.storage_tolerance)
+    run.decide(decision)
+    if room is None:
+        return stored
+    arrays = track_arrays(track, config.carried)
+    fixed = _HEADER + sum(compressed_bytes(arrays[name]) for name in ("motion", "distance"))
+
+    def other_bytes(kept: np.ndarray) -> int:
+        return fixed + compressed_bytes(carrier_arrays(track, track.carriers.keep(kept)[0], config.carried))
+
+    stored, spent = storage.within_room(room - _glass_bytes(appearance), stored, other_bytes)
+    if spent is not None:
+        run.decide(spent)
+    return stored
 
 
 def _glass_bytes(appearance: Appearance) -> int:
@@ -333,7 +352,9 @@ def _fit_appearance(
     optimisation = config.optimisation
     if learned:
         hand_on(learned.pop(), track, look, appearance, config.base_scale)
-        optimisation = replace(optimisation, begun=config.coarse_iterations)
+        # Of the iterations on these grids, the first ones have stand-ins for the background.
+        plates_share = 1 - (1 - config.coarse_grids_share) * (1 - config.plates_share)
+        optimisation = replace(optimisation, begun=config.coarse_iterations, plates_share=plates_share)
     elif look is not None:
         take_on(look, appearance.features, appearance.decoder)
     if device != CPU:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 # Of the draft: what a few seconds allow, and the share of them before its background.
-_DRAFT_ITERATIONS = 1000
+_DRAFT_ITERATIONS = 400
 _DRAFT_PLATES_SHARE = 0.25
 # And the edge of its hull voxels in pixels, and how few there are at least.
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
@@ -43,7 +43,7 @@ _COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "21"
+VERSION = "22"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -235,9 +235,9 @@ class SplashSplatConfig(MethodConfig):
     coarsest_share: float = Field(0.4, ge=0, le=1)
     #: pixels along the longest side beyond which photographs are large enough for that
     coarse_side: PositiveInt = 1500
-    #: share of the iterations, the first ones, that have the footage's clean plates behind the liquid: the background
-    #: is fitted afterwards; 0 fits it first. Not where it is drawn "together" with the liquid; where there are coarse
-    #: grids, `coarse_grids_share` instead
+    #: share of the iterations on fine grids, the first ones, that have the footage's clean plates behind the liquid, as
+    #: the background is fitted afterwards; 0 fits it first. Not where it is drawn "together" with the liquid; where
+    #: there are coarse grids and the liquid is transparent, the background comes before these
     plates_share: float = Field(0.2, ge=0, le=1)
     #: by how much rounding what is stored may raise the squared error in training photographs, as a share of it; 0
     #: stores in steps of a twentieth of each value's spread

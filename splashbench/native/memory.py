@@ -47,11 +47,23 @@ def empty(shape: tuple[int, ...]) -> NDArray[np.float32]:
             if count <= _buffers[i].size <= 2 * count and sys.getrefcount(_buffers[i]) <= _IDLE:
                 _buffers.append(_buffers.pop(i))
                 return _buffers[-1][:count].reshape(shape)
+        # The fresh one does where one little smaller did.
+        for i in reversed(range(len(_buffers))):
+            if count < 2 * _buffers[i].size < 2 * count and sys.getrefcount(_buffers[i]) <= _IDLE:
+                _buffers.pop(i)
         fresh = np.empty(count, np.float32)
         _buffers.append(fresh)
         while len(_buffers) > 1 and sum(buffer.nbytes for buffer in _buffers) > MAX_BYTES:
             _buffers.pop(0)  # lives on for as long as somebody holds a view of it
         return fresh.reshape(shape)
+
+
+def forget() -> None:
+    """Keep none of the buffers that nobody holds: images of the next part of a fit have other sizes."""
+    with _lock:
+        for i in reversed(range(len(_buffers))):
+            if sys.getrefcount(_buffers[i]) <= _IDLE:
+                _buffers.pop(i)
 
 
 def give_back() -> None:

@@ -53,6 +53,29 @@ def test_a_small_need_does_not_take_a_large_buffer():
     assert address(memory.empty((600, 1000))) != place
 
 
+def test_a_larger_buffer_takes_the_place_of_one_little_smaller():
+    """Needs that grow from step to step leave no row of buffers behind."""
+    held = memory.empty((550, 500, 3))
+    far_smaller = memory.empty((200, 500, 3))
+    for rows in range(560, 620, 10):
+        memory.empty((rows, 500, 3))
+    del far_smaller
+    assert sorted(len(buffer) // 1500 for buffer in memory._buffers) == [200, 550, 610]
+    held[:] = 7
+
+
+def test_what_nobody_holds_is_forgotten():
+    held = memory.empty(SHAPE)
+    place = address(held)
+    memory.empty((700, 500, 3))
+    assert len(memory._buffers) == 2
+    memory.forget()
+    assert [address(buffer) for buffer in memory._buffers] == [place]
+    del held
+    memory.forget()
+    assert memory._buffers == []
+
+
 def test_only_so_much_is_kept(monkeypatch):
     monkeypatch.setattr(memory, "MAX_BYTES", 10_000_000)
     arrays = [memory.empty(SHAPE) for _ in range(8)]  # 3.6 MB each

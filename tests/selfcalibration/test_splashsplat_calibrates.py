@@ -10,7 +10,7 @@ import pytest
 from splashbench import toml
 from splashbench.harness.contract import Run
 from splashbench.scene import Camera, Scene, SceneMeta, TrainingScene, write_scene
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method  # type: ignore[import-not-found]
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course  # type: ignore[import-not-found]
 
 from .conftest import NAMES, arc_camera, discs, light, photograph
 
@@ -43,8 +43,8 @@ def traced(scene: Scene, preset: str, monkeypatch: pytest.MonkeyPatch) -> tuple[
     def trace(seen: TrainingScene, *others: object) -> None:
         raise Traced(seen)
 
-    monkeypatch.setattr(method, "trace_liquid", trace)
-    monkeypatch.setattr("splashbench_methods.scaffold_gs.shared_background", lambda *others: None)
+    monkeypatch.setattr(course, "trace_liquid", trace)
+    monkeypatch.setattr("splashbench_methods.scaffold_gs.shared_background", lambda *others, **named: None)
     run = Run(seed=1)
     with pytest.raises(Traced) as stopped:
         SplashSplat().fit(scene.training(), SplashSplatConfig.preset(preset, SMALL), run)

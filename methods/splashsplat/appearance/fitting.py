@@ -323,6 +323,11 @@ def fit_appearance(
         return [features.of_frame(t, active.places), look.log_scales.index_select(0, active.ids)]
 
     @torch.no_grad()
+    def transparent() -> Tensor:
+        opacities = torch.cat([decoder.mean_opacity(block) for block in features.blocks()])
+        return (opacities < settings.prune_opacity).cpu()
+
+    @torch.no_grad()
     def withheld_look() -> WithheldLook:
         weights, total, quality = settings.weights, 0.0, []
         for number in np.nonzero(withheld_targets)[0]:
@@ -411,7 +416,7 @@ def fit_appearance(
             fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
             queue = rng.permutation(fitted).tolist()
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
-            carriers.drop((decoder.mean_opacity(features.all()).detach() < settings.prune_opacity).cpu())
+            carriers.drop(transparent())
             features.keep(carriers.ids)
         if (
             settings.idle_share > 0
@@ -466,7 +471,7 @@ def fit_appearance(
     reader.close()
     if glass is not None:
         glass.done()
-    look.features = features.all()
+    look.features = features.joined()
     appearance.become(look.to(CPU))
     return Fit(
         history,

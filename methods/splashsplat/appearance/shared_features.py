@@ -9,7 +9,7 @@ replaces the parts: decoder and files know nothing of them. Not in the paper.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,11 +21,14 @@ from .active import chosen
 from .cells import cell_numbers
 from .optimizer import RowAdam
 
+# Carriers whose features are summed up at once.
+_BLOCK = 1 << 16
+
 
 @dataclass(frozen=True)
 class _FeatureLevel:
-    """Cells of one size. cells: int64 [count] of all carriers. table: [cells, width], what each cell adds. rows,
-    members: per frame the cells of its carriers, ascending, and which of these each carrier is in."""
+    """Cells of one size. cells: int32 [count] of all carriers. table: [cells, width], what each cell adds. rows,
+    members: per frame the cells of its carriers, int64 and ascending, and which of these each carrier is in, int32."""
 
     cells: Tensor
     table: Tensor
@@ -66,7 +69,7 @@ class SharedFeatures:
         # Cells of different sizes have their faces at different places.
         rng = np.random.default_rng([seed, 4])
         for size, frames in extents:
-            cells = torch.from_numpy(cells_of(born, size, frames, rng.random(4))).to(own.device)
+            cells = torch.from_numpy(cells_of(born, size, frames, rng.random(4)).astype(np.int32)).to(own.device)
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
             self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), *_by_frame(cells, ids)))
 
@@ -85,13 +88,33 @@ class SharedFeatures:
 
     def all(self) -> Tensor:
         """Features of all carriers, [count, width]."""
-        return self._sum(torch.arange(len(self._own), device=self._own.device))
+        return self._summed(torch.empty_like(self._own))
+
+    def joined(self) -> Tensor:
+        """`all`, in the place of their own parts: the end of sharing."""
+        self._summed(self._own)
+        self._levels = []
+        del self._adam  # no step comes after this
+        return self._own
+
+    def _summed(self, whole: Tensor) -> Tensor:
+        row = 0
+        for block in self.blocks():
+            whole[row : row + len(block)] = block
+            row += len(block)
+        return whole
+
+    def blocks(self) -> Iterator[Tensor]:
+        """Features of all carriers, [., width] in turn: those of all at once would be what takes most memory."""
+        for rows in torch.arange(len(self._own), device=self._own.device).split(_BLOCK):
+            yield self._sum(rows)
 
     def step(self, t: int, gradient: Tensor, factor: float, places: Tensor | None = None) -> None:
         """Descend along the `gradient` [n, width] of what `of_frame` gave; `factor` scales the rates."""
         self._adam.step(chosen(self._ids[t], places), gradient, factor)
         for level in self._levels:
-            rows, members = level.rows[t], chosen(level.members[t], places)
+            # Sums by int32 take six times as long.
+            rows, members = level.rows[t], chosen(level.members[t], places).to(torch.int64)
             summed = gradient.new_zeros(len(rows), gradient.shape[1]).index_add_(0, members, gradient)
             level.adam.step(rows, summed, factor)
 
@@ -104,8 +127,13 @@ class SharedFeatures:
 
 def _by_frame(cells: Tensor, ids: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
     """Per frame, with carriers `ids`: the cells that they are in, ascending, and which of these each is in."""
-    found = [torch.unique(cells.index_select(0, of_frame), return_inverse=True) for of_frame in ids]
+    found = [_cells_and_members(cells.index_select(0, of_frame)) for of_frame in ids]
     return [rows for rows, _ in found], [members for _, members in found]
+
+
+def _cells_and_members(cells: Tensor) -> tuple[Tensor, Tensor]:
+    rows, members = torch.unique(cells, return_inverse=True)
+    return rows.to(torch.int64), members.to(torch.int32)
 
 
 def births(carriers: Carriers) -> np.ndarray:

@@ -49,8 +49,13 @@ def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]
     return {
         "carriers": carrier_arrays(track, track.carriers, carried),
         "motion": motion_arrays(track.motion),
-        "distance": {"phi": store_distance(track.phi)},
+        "distance": distance_arrays(track.phi),
     }
+
+
+def distance_arrays(phi: np.ndarray) -> dict[str, np.ndarray]:
+    """What is stored of the packed phi of all frames."""
+    return {"phi": store_distance(phi)}
 
 
 def motion_arrays(motion: Motion) -> dict[str, np.ndarray]:

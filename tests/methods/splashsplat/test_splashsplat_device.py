@@ -20,7 +20,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Run
 from splashbench.render import autograd, backends
 from splashbench.scene import Scene
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course
 from splashbench_methods.splashsplat import settings as settings_module
 from splashbench_methods.splashsplat.appearance import fitting, losses
 from splashbench_methods.splashsplat.appearance.compositing import composite
@@ -86,7 +86,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         return original(name, means)
 
     monkeypatch.setattr(backends, "backend_for", backend_for)
-    for module in (method, side_by_side):
+    for module in (course, side_by_side):
         monkeypatch.setattr(module, "thread_count", lambda: 1)  # the device is the thread's own
     with virtual_device() as name, one_torch_thread():
         yield name
@@ -110,7 +110,8 @@ ALONE = {"draft_cells": 0, "storage_tolerance": 0.0}
 
 #: Settings that between them reach every part of a fit.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
-    "best": ("best", {"draft_cells": 24}),
+    "best": ("best", {"draft_cells": 24, "storage_tolerance": 0.0}),
+    "storing": ("best", {"draft_cells": 0, "coarse_grids_share": 0.0}),
     "glass": ("best", ALONE | {"glass": 100, "beside_weight": 0.5, "clear_idle_early": True}),
     "coarse first": ("quick", ALONE | {"coarse_share": 0.4, "coarsest_share": 0.2, "coarse_side": 1}),
     "auto": ("auto", ALONE | {"iterations": 120}),
@@ -139,8 +140,8 @@ def test_a_fit_there_is_the_cpus(
     expected = _images(_fitted(balls, "cpu", preset, settings, tmp_path / "cpu"), balls)
     fitted = _fitted(balls, device, preset, settings, tmp_path / "device")
     images = _images(fitted, balls)
-    # Sums in another order end in another fit, a little.
-    assert np.quantile(np.abs(images - expected), 0.99) < 1e-3
+    # Sums in another order end in another fit, a little; and, where a trial goes the other way, in another step.
+    assert np.quantile(np.abs(images - expected), 0.99) < (1e-2 if case == "storing" else 1e-3)
     fitted.to_device(device)
     assert np.abs(_images(fitted, balls) - images).max() < 1e-5
     assert fitted.gaussians(float(balls.times[2]), balls.cameras["6"].center) is not None

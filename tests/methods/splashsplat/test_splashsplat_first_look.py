@@ -14,7 +14,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench_methods import scaffold_gs
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course
 from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
 from splashbench_methods.splashsplat.appearance.first_look import Look, photographed, take_on
@@ -185,9 +185,9 @@ def test_the_background_comes_after_the_first_iterations(
     calls: list[int] = []
     fit_background = scaffold_gs.shared_background
 
-    def background(*arguments):
+    def background(*arguments, **others):
         calls.append(len(shown))
-        return fit_background(*arguments)
+        return fit_background(*arguments, **others)
 
     monkeypatch.setattr(fitting, "image_loss", note)
     monkeypatch.setattr(scaffold_gs, "shared_background", background)
@@ -215,6 +215,6 @@ def test_masks_that_leave_no_background_are_refused_at_once(balls_copy: Path, mo
         write_png(path, np.full_like(read_image(path), 255))
     scene = Scene.open(balls_copy).training()
     assert all(scene.mask(name, t).all() for name in scene.train for t in range(scene.n_frames))
-    monkeypatch.setattr(method, "trace_liquid", lambda *arguments: pytest.fail("minutes went by first"))
+    monkeypatch.setattr(course, "trace_liquid", lambda *arguments: pytest.fail("minutes went by first"))
     with pytest.raises(SplashbenchError, match=r"liquid masks cover every training view throughout; fix the masks"):
         SplashSplat().fit(scene, SplashSplatConfig.preset("best", TINY), Run(seed=1))

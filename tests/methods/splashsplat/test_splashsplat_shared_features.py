@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from splashbench_methods.splashsplat.appearance import shared_features
 from splashbench_methods.splashsplat.appearance.optimizer import RowAdam
 from splashbench_methods.splashsplat.appearance.shared_features import SharedFeatures, births, cells_of
 from splashbench_methods.splashsplat.carriers.tracking import Carriers
@@ -147,3 +148,18 @@ def test_settings_reach_the_fit() -> None:
         "quick": 2.0,
     }
     assert SplashSplatConfig(learning_rate_cells=0.007).optimisation.learning_rate_cells == 0.007
+
+
+@pytest.mark.parametrize("block", [1, 3, 4])
+def test_the_parts_are_joined_block_by_block(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    features, own = _features(1e6, 2.0)
+    features.step(0, torch.tensor([[1.0, -1.0], [0.5, 2.0]]), factor=1.0)
+    expected = features.of_frame(0), features.all()
+    monkeypatch.setattr(shared_features, "_BLOCK", block)
+    assert [len(part) for part in features.blocks()] == ([block] * (4 // block) + [4 % block] * (4 % block > 0))
+    assert torch.equal(features.all(), expected[1])
+    joined = features.joined()
+    assert joined.data_ptr() == own.data_ptr()
+    assert torch.equal(joined, expected[1])
+    assert torch.equal(features.of_frame(0), expected[0])
+    assert torch.equal(features.all(), joined)

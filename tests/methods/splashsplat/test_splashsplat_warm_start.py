@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
-from splashbench.harness import side_by_side
-from splashbench.harness.checkpoints import Checkpoints
-from splashbench.harness.contract import Budget, Fitted, Run
 from splashbench.observe.grid import Grid
-from splashbench.scene import Scene, TrainingScene
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, method, reconstruction
 from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, initial_log_scale
 from splashbench_methods.splashsplat.appearance.first_look import Look, features_of
-from splashbench_methods.splashsplat.appearance.fitting import Appearance, Fit, FitSettings, initial_appearance
+from splashbench_methods.splashsplat.appearance.fitting import Appearance, FitSettings, initial_appearance
 from splashbench_methods.splashsplat.appearance.glass import Glass
 from splashbench_methods.splashsplat.appearance.schedule import FixedSchedule
 from splashbench_methods.splashsplat.appearance.warm_start import Learned, hand_on, nearest_carriers
 from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.subframe import Track
-from splashbench_methods.splashsplat.coarse_fit import CoarseFit
 from splashbench_methods.splashsplat.motion.steps import Motion
 
 BASE_SCALE = 0.5
@@ -117,144 +107,3 @@ def test_a_schedule_goes_on_where_another_fit_ended() -> None:
     assert [rest.factor(i) for i in range(71)] == [whole.factor(i) for i in range(30, 101)]
     assert rest.factor(70) is None
     assert rest.done(20) == whole.done(50)
-
-
-def error(fitted: Fitted, scene: Scene) -> float:
-    camera = scene.cameras["6"]
-    return float(
-        np.mean([
-            np.square(fitted.render(camera, float(scene.times[t])).rgb - scene.image("6", t) / 255).mean()
-            for t in range(scene.n_frames)
-        ])
-    )  # fmt: skip
-
-
-def fitted(scene: Scene, run: Run | None = None, **settings: Any) -> Fitted:
-    config = SplashSplatConfig.preset("best", SMALL | {"background_preset": "quick"} | settings)
-    return SplashSplat().fit(scene.training(), config, run or Run())
-
-
-@pytest.fixture
-def coarse_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many iterations each coarse fit has had."""
-    made: list[int] = []
-    original = method.fit_coarsely
-
-    def fit_coarsely(scene: TrainingScene, config: SplashSplatConfig, *others: Any) -> CoarseFit:
-        made.append(config.coarse_iterations)
-        return original(scene, config, *others)
-
-    monkeypatch.setattr(method, "fit_coarsely", fit_coarsely)
-    return made
-
-
-@pytest.fixture
-def steps(monkeypatch: pytest.MonkeyPatch) -> dict[float, int]:
-    """How many iterations were made on grids of so large transport voxels (scene units)."""
-    made: dict[float, int] = {}
-    original = reconstruction.fit_appearance
-
-    def fit_appearance(look: Any, track: Track, *others: Any) -> Fit:
-        fit = original(look, track, *others)
-        made[track.grid.voxel] = made.get(track.grid.voxel, 0) + len(fit.losses)
-        return fit
-
-    monkeypatch.setattr(reconstruction, "fit_appearance", fit_appearance)
-    return made
-
-
-def test_the_first_iterations_are_made_on_coarse_grids(
-    balls: Scene, flat_background: None, coarse_fits: list[int], steps: dict[float, int]
-) -> None:
-    with_it = fitted(balls, iterations=100, coarse_grids_share=0.4)
-    assert coarse_fits == [40]
-    fine, coarse = sorted(steps)
-    assert coarse > 1.4 * fine
-    assert steps == {coarse: 40, fine: 60}
-    # Sixty steps of a hundred, alone: the rates are as high, but nothing was learned before.
-    steps.clear()
-    without = fitted(balls, iterations=60, coarse_grids_share=0.0)
-    assert steps == {fine: 60}
-    assert error(with_it, balls) < error(without, balls)
-
-
-def on_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """Parts of a fit are made on so many cores."""
-    for module in (method, side_by_side):
-        monkeypatch.setattr(module, "thread_count", lambda: count)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_who_looks_on_changes_nothing(
-    balls: Scene, flat_background: None, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    on_cores(monkeypatch, threads)
-    images = []
-    for watched in (False, True):
-        run = Run()
-        if watched:
-            run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
-        found = fitted(balls, run, iterations=40, draft_cells=0)
-        images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
-    np.testing.assert_array_equal(*images)
-
-
-def test_what_is_shown_on_one_core(
-    balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The coarse fit as it goes and at its end, the same before the background, and the fine one."""
-    shown: list[tuple[int, bool]] = []
-    run = Run()
-    run._checkpoints = Checkpoints(tmp_path, [1e9], lambda: 7.0, lambda: None)
-
-    def offer(state: Callable[[], Fitted], milestone: bool) -> None:
-        if milestone:
-            model = state()
-            assert isinstance(model, method.FittedSplashSplat)
-            shown.append((model.liquid.carriers.count, len(model.background.model) > 0))
-
-    monkeypatch.setattr(run._checkpoints, "offer", offer)
-    on_cores(monkeypatch, 1)
-    fitted(balls, run, iterations=40, draft_cells=0)
-    (first, before), (second, behind) = shown
-    assert (before, behind) == (False, True)
-    assert first == second
-
-
-def test_where_the_coarse_fit_learns_nothing_there_is_none(
-    balls: Scene, flat_background: None, steps: dict[float, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(method, "fit_coarsely", lambda *_: None)
-    fitted(balls, iterations=10)
-    assert list(steps.values()) == [10]
-
-
-def test_a_run_aside_leaves_no_record(tmp_path: Path) -> None:
-    told: list[tuple[float, str]] = []
-    run = Run(seed=3, device="cuda", directory=tmp_path, budget=Budget(seconds=5.0))
-    run._report = lambda done, message: told.append((done, message))
-    part = run.aside((0.2, 0.6))
-    assert (part.seed, part.device, part.directory, part.budget.limits) == (3, "cuda", tmp_path, {})
-    part.progress(0.5, "half")
-    part.note("name", "text")
-    with part.stage("stage"):
-        run.aside().progress(0.9, "nobody is told")
-    assert told == [(pytest.approx(0.4), "half")]
-    assert not run.notes
-    assert not run.stages
-
-
-@pytest.mark.parametrize(
-    ("settings", "budget"),
-    [
-        ({"validation_share": 0.04}, Budget()),
-        ({"plates_share": 0.0}, Budget()),
-        ({}, Budget(seconds=60.0)),
-        ({"coarse_grids_share": 0.0}, Budget()),
-    ],
-)
-def test_there_is_none_where_something_else_ends_the_fit(
-    settings: dict[str, Any], budget: Budget, balls: Scene, flat_background: None, coarse_fits: list[int]
-) -> None:
-    fitted(balls, Run(budget=budget), iterations=12, **settings)
-    assert coarse_fits == []

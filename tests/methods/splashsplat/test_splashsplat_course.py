@@ -1,0 +1,261 @@
+"""The order in which the parts of a fit are made, and what is shown on the way."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splashbench.harness import side_by_side
+from splashbench.harness.checkpoints import Checkpoints
+from splashbench.harness.contract import Budget, Fitted, Run
+from splashbench.scene import Scene, TrainingScene
+from splashbench_methods import scaffold_gs
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, reconstruction
+from splashbench_methods.splashsplat import settings as settings_module
+from splashbench_methods.splashsplat.appearance import fitting
+from splashbench_methods.splashsplat.appearance.fitting import Fit
+from splashbench_methods.splashsplat.appearance.warm_start import Learned
+from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.method import FittedSplashSplat
+
+SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 6, "velocity_steps": 2, "self_calibration": False}
+
+
+def error(fitted: Fitted, scene: Scene) -> float:
+    camera = scene.cameras["6"]
+    return float(
+        np.mean([
+            np.square(fitted.render(camera, float(scene.times[t])).rgb - scene.image("6", t) / 255).mean()
+            for t in range(scene.n_frames)
+        ])
+    )  # fmt: skip
+
+
+def fitted(scene: Scene, run: Run | None = None, **settings: Any) -> Fitted:
+    config = SplashSplatConfig.preset("best", SMALL | {"background_preset": "quick"} | settings)
+    return SplashSplat().fit(scene.training(), config, run or Run())
+
+
+@pytest.fixture
+def coarse_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many iterations each coarse fit has had."""
+    made: list[int] = []
+    original = course.fit_coarsely
+
+    def fit_coarsely(scene: TrainingScene, config: SplashSplatConfig, *others: Any) -> list[Learned]:
+        made.append(config.coarse_iterations)
+        return original(scene, config, *others)
+
+    monkeypatch.setattr(course, "fit_coarsely", fit_coarsely)
+    return made
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> dict[float, int]:
+    """How many iterations were made on grids of so large transport voxels (scene units)."""
+    made: dict[float, int] = {}
+    original = reconstruction.fit_appearance
+
+    def fit_appearance(look: Any, track: Track, *others: Any) -> Fit:
+        fit = original(look, track, *others)
+        made[track.grid.voxel] = made.get(track.grid.voxel, 0) + len(fit.losses)
+        return fit
+
+    monkeypatch.setattr(reconstruction, "fit_appearance", fit_appearance)
+    return made
+
+
+def test_the_first_iterations_are_made_on_coarse_grids(
+    balls: Scene, flat_background: None, coarse_fits: list[int], steps: dict[float, int]
+) -> None:
+    with_it = fitted(balls, iterations=100, coarse_grids_share=0.4)
+    assert coarse_fits == [40]
+    fine, coarse = sorted(steps)
+    assert coarse > 1.4 * fine
+    assert steps == {coarse: 40, fine: 60}
+    # Sixty steps of a hundred, alone: the rates are as high, but nothing was learned before.
+    steps.clear()
+    without = fitted(balls, iterations=60, coarse_grids_share=0.0)
+    assert steps == {fine: 60}
+    assert error(with_it, balls) < error(without, balls)
+
+
+def on_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Parts of a fit are made on so many cores."""
+    for module in (course, side_by_side):
+        monkeypatch.setattr(module, "thread_count", lambda: count)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_who_looks_on_changes_nothing(
+    balls: Scene, flat_background: None, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_cores(monkeypatch, threads)
+    images = []
+    for watched in (False, True):
+        run = Run()
+        if watched:
+            run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
+        found = fitted(balls, run, iterations=40, draft_cells=0)
+        images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Which parts were begun, in their order, and after how many iterations since the part before."""
+    begun: list[str] = []
+
+    def noted(module: Any, name: str, word: Callable[..., str]) -> None:
+        original = getattr(module, name)
+
+        def function(*arguments: Any, **others: Any) -> Any:
+            begun.append(word(*arguments))
+            return original(*arguments, **others)
+
+        monkeypatch.setattr(module, name, function)
+
+    noted(course, "fit_coarsely", lambda *_: "coarse")
+    noted(course, "trace_liquid", lambda *_: "trace")
+    noted(scaffold_gs, "shared_background", lambda *_: "background")
+    noted(fitting, "image_loss", lambda *_: "step")
+    return begun
+
+
+def in_order(parts: list[str]) -> list[str | int]:
+    """`parts` with iterations counted."""
+    return [len(list(group)) if name == "step" else name for name, group in itertools.groupby(parts)]
+
+
+TRANSPARENT = pytest.mark.parametrize("share", [0.0, 1.0])
+
+
+@TRANSPARENT
+def test_where_the_background_comes(
+    share: float, balls: Scene, short_background: None, parts: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """First where the liquid is transparent; else after the first fifth of the iterations on fine grids."""
+    on_cores(monkeypatch, 1)
+    monkeypatch.setattr(course, "transmittance", lambda *_: share)
+    run = Run()
+    fitted(balls, run, iterations=50, coarse_grids_share=0.2)
+    late, first = ["coarse", 10, "trace", 8, "background", 32], ["background", "coarse", 10, "trace", 40]
+    assert in_order(parts) == (first if share else late)
+    (decision,) = [found for found in run.decisions if found.name == "background"]
+    assert decision.chosen == ("before the coarse grids" if share else "once fine grids show something")
+    assert f"{100 * share:.0f} %" in decision.because
+
+
+@TRANSPARENT
+def test_cores_decide_what_is_made_beside_what_and_nothing_else(
+    share: float, balls: Scene, short_background: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(course, "transmittance", lambda *_: share)
+    images = []
+    for cores in (1, 2):
+        on_cores(monkeypatch, cores)
+        found = fitted(balls, iterations=40)
+        images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
+    np.testing.assert_array_equal(*images)
+
+
+#: Liquid and whether there is a background, of each state with none to follow for a while.
+Milestones = list[tuple[int, bool]]
+
+
+def milestones(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Milestones:
+    """Of `run`, from now on."""
+    shown: Milestones = []
+    run._checkpoints = Checkpoints(tmp_path, [1e9], lambda: 7.0, lambda: None)
+
+    def offer(state: Callable[[], Fitted], milestone: bool) -> None:
+        if milestone:
+            model = state()
+            assert isinstance(model, FittedSplashSplat)
+            shown.append((model.liquid.carriers.count, len(model.background.model) > 0))
+
+    monkeypatch.setattr(run._checkpoints, "offer", offer)
+    return shown
+
+
+def test_opaque_liquid_is_shown_before_there_is_a_background(
+    balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coarse liquid, and the fine one once all photographs were seen."""
+    on_cores(monkeypatch, 1)
+    run = Run()
+    shown = milestones(run, tmp_path, monkeypatch)
+    fitted(balls, run, iterations=300, draft_cells=0, plates_share=0.5)
+    (coarse, before), (fine, then) = shown
+    assert (before, then) == (False, False)
+    assert fine > 1.5 * coarse
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_transparent_liquid_is_shown_before_the_background_first(
+    cores: int, balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The draft with a coarse background, the same liquid before the fitted one, and the coarse grids'."""
+    on_cores(monkeypatch, cores)
+    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    monkeypatch.setattr(course, "transmittance", lambda *_: 1.0)
+    run, offered = Run(), []
+    shown = milestones(run, tmp_path, monkeypatch)
+    original = scaffold_gs.shared_background
+
+    def shared_background(*arguments: Any, offer: Any = None) -> scaffold_gs.Background:
+        offered.append(offer is not None)
+        return original(*arguments, offer=offer)
+
+    monkeypatch.setattr(scaffold_gs, "shared_background", shared_background)
+    fitted(balls, run, iterations=40, draft_cells=32)
+    drafted, behind, coarse = shown[-3:]
+    assert drafted[0] == behind[0] != coarse[0]
+    assert behind[1]
+    assert coarse[1]
+    # States on the way stop the clock, and with it what runs beside the background.
+    assert offered == [cores == 1]
+
+
+def test_where_the_coarse_fit_learns_nothing_there_is_none(
+    balls: Scene, flat_background: None, steps: dict[float, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(course, "fit_coarsely", lambda *_: [])
+    fitted(balls, iterations=10)
+    assert list(steps.values()) == [10]
+
+
+def test_a_run_aside_leaves_no_record(tmp_path: Path) -> None:
+    told: list[tuple[float, str]] = []
+    run = Run(seed=3, device="cuda", directory=tmp_path, budget=Budget(seconds=5.0))
+    run._report = lambda done, message: told.append((done, message))
+    part = run.aside((0.2, 0.6))
+    assert (part.seed, part.device, part.directory, part.budget.limits) == (3, "cuda", tmp_path, {})
+    part.progress(0.5, "half")
+    part.note("name", "text")
+    with part.stage("stage"):
+        run.aside().progress(0.9, "nobody is told")
+    assert told == [(pytest.approx(0.4), "half")]
+    assert not run.notes
+    assert not run.stages
+
+
+@pytest.mark.parametrize(
+    ("settings", "budget"),
+    [
+        ({"validation_share": 0.04}, Budget()),
+        ({"plates_share": 0.0}, Budget()),
+        ({}, Budget(seconds=60.0)),
+        ({"coarse_grids_share": 0.0}, Budget()),
+    ],
+)
+def test_there_is_none_where_something_else_ends_the_fit(
+    settings: dict[str, Any], budget: Budget, balls: Scene, flat_background: None, coarse_fits: list[int]
+) -> None:
+    fitted(balls, Run(budget=budget), iterations=12, **settings)
+    assert coarse_fits == []
