@@ -22,12 +22,13 @@ from .settings import SplashSplatConfig
 _TRACE = 0.4
 
 
-def begins_on_coarse_grids(config: SplashSplatConfig, run: Run) -> bool:
-    """Whether the fit by `config` has such a part: with a fixed schedule, without a budget, and where plates stand for
-    the background at first."""
+def begins_on_coarse_grids(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> bool:
+    """Whether the fit of `scene` by `config` has such a part: where photographs are small, with a fixed schedule,
+    without a budget, and where plates stand for the background at first."""
     plates = config.plates_share > 0 and config.composition != "together"
     fixed = config.validation_share == 0 and not run.budget.limits
-    return plates and fixed and config.coarse_iterations > 0
+    longest = max(max(camera.width, camera.height) for camera in scene.cameras.values())
+    return plates and fixed and config.coarse_iterations > 0 and longest <= config.coarse_grids_side
 
 
 def fit_coarsely(

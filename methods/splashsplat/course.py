@@ -79,7 +79,7 @@ class Course:
             self._drafted = self._draft(self._show)
             self._background = self._drafted[1]
         self._calibrate()
-        if begins_on_coarse_grids(self._config, self._run):
+        if begins_on_coarse_grids(self._scene, self._config, self._run):
             return self._from_coarse_grids()
         self._drafted = None
         return self._at_once()

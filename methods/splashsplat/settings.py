@@ -43,7 +43,7 @@ _COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "22"
+VERSION = "23"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -170,6 +170,8 @@ class SplashSplatConfig(MethodConfig):
     #: where the schedule is fixed, the background is not fitted first (`plates_share`), and no budget is to be kept.
     #: The background is fitted after them
     coarse_grids_share: float = Field(0.2, ge=0, le=0.5)
+    #: pixels along the longest side up to which photographs are small enough for that: larger ones show what it loses
+    coarse_grids_side: PositiveInt = 320
     #: learning rate of carriers' own features
     learning_rate_features: PositiveFloat = 0.06
     #: learning rate of the features that carriers of a cell share

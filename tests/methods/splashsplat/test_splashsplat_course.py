@@ -252,6 +252,7 @@ def test_a_run_aside_leaves_no_record(tmp_path: Path) -> None:
         ({"plates_share": 0.0}, Budget()),
         ({}, Budget(seconds=60.0)),
         ({"coarse_grids_share": 0.0}, Budget()),
+        ({"coarse_grids_side": 95}, Budget()),  # photographs are 96 pixels wide
     ],
 )
 def test_there_is_none_where_something_else_ends_the_fit(
