@@ -167,8 +167,7 @@ class SplashSplatConfig(MethodConfig):
     #: steps of the appearance's fit, at most
     iterations: int = Field(4000, ge=0)
     #: share of them, the first ones, made on coarse grids, whose carriers the fine ones begin with; 0 for none. Only
-    #: where the schedule is fixed, the background is not fitted first (`plates_share`), and no budget is to be kept.
-    #: The background is fitted after them
+    #: where the schedule is fixed, the background is not fitted first (`plates_share`), and no budget is to be kept
     coarse_grids_share: float = Field(0.2, ge=0, le=0.5)
     #: pixels along the longest side up to which photographs are small enough for that: larger ones show what it loses
     coarse_grids_side: PositiveInt = 320

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def transmittance(scene: TrainingScene, plates: Plates) -> float:
 
     plates: of the training views, in their size. 0 where no view says anything.
     """
-    frames = np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, _FRAMES)).round().astype(int))
+    frames = spread_frames(scene.n_frames, _FRAMES)
     shares = [share for name in scene.train if (share := _of_view(scene, plates, name, frames)) is not None]
     return float(np.clip(np.median(shares), 0, 1)) if shares else 0.0
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.scene import Camera, TrainingScene
+from splashbench.scene.frames import spread_frames
 
 # A median needs no more; reading every frame of a long 4K recording takes memory and minutes.
 MAX_FRAMES = 32
@@ -59,7 +60,7 @@ def make_clean_plate(
     every frame, as a rim is beside a pool, are taken from half as near.
     """
     camera = scene.cameras[name]
-    frames = np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, n_frames)).round().astype(int))
+    frames = spread_frames(scene.n_frames, n_frames)
     radius = max(2, round(_MARGIN * max(camera.width, camera.height)))
     near_still = near_still and len(frames) > 1  # one frame says nothing of what liquid is always beside
     margins = (radius, radius // 2) if near_still else (radius,)

@@ -24,6 +24,7 @@ from scipy.ndimage import gaussian_filter
 
 from splashbench.background.clean_plate import masked_median
 from splashbench.observe.silhouettes import outline_distance
+from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
 _Images = NDArray[np.uint8]
@@ -165,7 +166,7 @@ def outlines(scene: TrainingScene, names: Sequence[str]) -> dict[str, Outlines]:
 
 def _sample(scene: TrainingScene, name: str) -> _Sample:
     camera = scene.cameras[name]
-    chosen = np.unique(np.linspace(0, scene.n_frames - 1, min(_FRAMES, scene.n_frames)).round().astype(int)).tolist()
+    chosen = spread_frames(scene.n_frames, _FRAMES).tolist()
     scale = min(1.0, _SIDE / max(camera.width, camera.height))
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     images = np.empty((len(chosen), size[1], size[0], 3), np.uint8)

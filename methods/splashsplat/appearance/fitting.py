@@ -70,7 +70,7 @@ _GIVE_BACK_EVERY, _GIVE_BACK_PIXELS = 25, 1 << 20
 # glass it is a decibel below for some seconds.
 _SHOWN_FROM = 0.25
 # The same of a fit that goes on from coarse grids, whose last state is better than the first ones on others. (Losses of
-# both say little, as plates lay behind the coarse ones: to wait for a smaller one took glass_tank a minute more.)
+# both say little, as plates lay behind most coarse ones: to wait for a smaller one took glass_tank a minute more.)
 _SHOWN_AGAIN_FROM = 1.25
 
 

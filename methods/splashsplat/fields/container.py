@@ -17,6 +17,7 @@ import numpy as np
 from splashbench.container.mask_vessel import MaskedVessel, vessel_from_masks
 from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera
+from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
 ContainerSource = Literal["mesh", "masks", "none"]
@@ -70,7 +71,7 @@ def shows_liquid_through_walls(scene: TrainingScene, vessel: MaskedVessel, masks
         opening = _opening(camera, vessel.rim)
         if opening is None:
             continue
-        for t in np.unique(np.linspace(0, scene.n_frames - 1, min(scene.n_frames, _FRAMES)).round().astype(int)):
+        for t in spread_frames(scene.n_frames, _FRAMES):
             liquid = scene.mask(name, int(t)) & mask
             everywhere += int(liquid.sum())
             walls += int((liquid & ~opening).sum())

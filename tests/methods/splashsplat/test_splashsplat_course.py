@@ -91,17 +91,25 @@ def on_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
         monkeypatch.setattr(module, "thread_count", lambda: count)
 
 
+#: How much shows through the liquid.
+TRANSPARENT = pytest.mark.parametrize("share", [0.0, 1.0])
+
+
 @pytest.mark.parametrize("threads", [1, 2])
+@TRANSPARENT
 def test_who_looks_on_changes_nothing(
-    balls: Scene, flat_background: None, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
+    share: float, threads: int, balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """With a draft, and states on the way."""
     on_cores(monkeypatch, threads)
+    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    monkeypatch.setattr(course, "transmittance", lambda *_: share)
     images = []
     for watched in (False, True):
         run = Run()
         if watched:
             run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
-        found = fitted(balls, run, iterations=40, draft_cells=0)
+        found = fitted(balls, run, iterations=40, draft_cells=32)
         images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
     np.testing.assert_array_equal(*images)
 
@@ -130,9 +138,6 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def in_order(parts: list[str]) -> list[str | int]:
     """`parts` with iterations counted."""
     return [len(list(group)) if name == "step" else name for name, group in itertools.groupby(parts)]
-
-
-TRANSPARENT = pytest.mark.parametrize("share", [0.0, 1.0])
 
 
 @TRANSPARENT

@@ -19,7 +19,6 @@ from splashbench_methods.splashsplat.carriers.subframe import Track
 from splashbench_methods.splashsplat.motion.steps import Motion
 
 BASE_SCALE = 0.5
-SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 6, "velocity_steps": 2, "self_calibration": False}
 
 
 def track(frames: list[list[tuple[int, float]]], voxel: float, origin: float = 0.0) -> Track:
