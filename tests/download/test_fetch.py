@@ -256,7 +256,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(server: Any, tmp_path: Path)
 def script(file: RemoteFile, folder: Path) -> str:
     """A program that fetches `file` into `folder`."""
     return (
-        "import sys\nfrom pathlib import Path\n"
+        # What a shell runs in the background ignores SIGINT, and hands that on.
+        "import signal, sys\nfrom pathlib import Path\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from splashbench.download.fetch import RemoteFile, alone, fetch\n"
         f"file, target = RemoteFile(*{(file.url, file.size, file.sha256)!r}), Path({str(folder / 'f.bin')!r})\n"
         "with alone(target, lambda text: print(text, file=sys.stderr)):\n    fetch(file, target, remedy='-')\n"
