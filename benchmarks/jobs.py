@@ -1,7 +1,7 @@
 """What a run of a study costs beyond its method: many runs of a method that does nothing, here and on Ray.
 
     python benchmarks/jobs.py                                 # 1,000 runs, two at once, here
-    python benchmarks/jobs.py --jobs 100 --places here ray    # on Ray too (pip install 'splashbench[cluster]')
+    python benchmarks/jobs.py --jobs 100 --places here ray    # on Ray too (with the extra cluster)
     python benchmarks/jobs.py --markdown TABLE.md --json FILE
 
 The scene is the smallest there is: balls in front of seven cameras, two frames, 24x16 pixels. The method has one grey

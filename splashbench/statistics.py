@@ -66,16 +66,19 @@ def resampled(by_scene: Sequence[NDArray[np.float64]], samples: int = SAMPLES) -
     return np.asarray(runs[_draws(tuple(len(scene) for scene in by_scene), samples)])
 
 
-@lru_cache(maxsize=32)
-def _draws(sizes: tuple[int, ...], samples: int) -> NDArray[np.int64]:
-    """Indices of `resampled` into the runs of all scenes one after the other; -1 for none."""
+@lru_cache(maxsize=8)
+def _draws(sizes: tuple[int, ...], samples: int) -> NDArray[np.int32]:
+    """Indices of `resampled` into the runs of all scenes one after the other; -1 for none.
+
+    Kept, as figures of one group have the same runs; few, as those of a thousand runs take 8 MB.
+    """
     rng = np.random.default_rng(0)
     counts, starts = np.array(sizes), np.concatenate([[0], np.cumsum(sizes)[:-1]])
     scenes = rng.integers(len(sizes), size=(samples, len(sizes)))
     seeds = rng.random((samples, len(sizes), max(sizes)))
     count = counts[scenes][..., None]
     found = np.where(np.arange(max(sizes)) < count, starts[scenes][..., None] + (seeds * count).astype(int), -1)
-    return np.asarray(found.reshape(samples, -1))
+    return np.asarray(found.reshape(samples, -1), dtype=np.int32)
 
 
 def estimate(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from matplotlib import rc_context
@@ -289,8 +290,8 @@ def told_nothing() -> Figure:
     return figure
 
 
-def quality_over_time() -> Figure:
-    rows = [row for row in read(HERE / "data" / "quality_over_time.csv") if row["seconds"]]
+def quality_over_time(name: str = "quality_over_time") -> Figure:
+    rows = [row for row in read(HERE / "data" / f"{name}.csv") if row["seconds"]]
     figure = Figure(figsize=(9.2, 2.8), layout="constrained")
     places = figure.subplots(1, 3)
     marks = (("spacetime_gaussians", "s", GREY), ("scaffold_4d", "D", BLUE), ("splashsplat", "o", VERMILION))
@@ -306,7 +307,9 @@ def quality_over_time() -> Figure:
             place.step(*zip(*points), where="post", color=color, lw=1.4)
             place.plot(*zip(*points), marker, mec=color, mfc="white", ms=4, label=name)
         place.set_xscale("log")
-        place.set_xticks([5, 10, 20, 40, 80, 160, 300], ["5", "10", "20", "40", "80", "160", "300"], minor=False)
+        last = max(float(row["seconds"]) for row in rows)
+        ticks = (5, 10, 20, 40, 80, 160, 300) if last <= 300 else (10, 20, 40, 80, 160, 320, 640)
+        place.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
         place.set_xticks([], minor=True)
         place.set_xlabel("seconds of the fit")
         place.set_title(title)
@@ -316,14 +319,16 @@ def quality_over_time() -> Figure:
 
 def capacity() -> Figure:
     rows = read(HERE / "data" / "capacity.csv")
-    figure = Figure(figsize=(7.2, 2.8), layout="constrained")
-    places = figure.subplots(1, 2)
-    units = (("seconds", "budget of seconds"), ("megabytes", "budget of megabytes"))
-    for place, (unit, title) in zip(places, units):
+    figure = Figure(figsize=(9.2, 2.8), layout="constrained")
+    places = figure.subplots(1, 3)
+    units = (
+        ("seconds", "thin_stream", "budget of seconds"),
+        ("megabytes", "thin_stream", "budget of megabytes stored"),
+        ("memory", "opaque_bowl", "budget of megabytes of memory"),
+    )
+    for place, (unit, scene, title) in zip(places, units):
         points = [
-            (float(row["limit"]), float(row["psnr"]))
-            for row in rows
-            if (row["budget"], row["scene"]) == (unit, "thin_stream")
+            (float(row["limit"]), float(row["psnr"])) for row in rows if (row["budget"], row["scene"]) == (unit, scene)
         ]
         place.plot(*zip(*sorted(points)), "o-", color=BLUE, mfc="white", ms=4, lw=1.4)
         place.set_xscale("log")
@@ -331,7 +336,7 @@ def capacity() -> Figure:
         place.set_xticks(ticks, [f"{limit:g}" for limit in ticks], minor=False)
         place.set_xticks([], minor=True)
         place.set_xlabel(title)
-    places[0].set_title("PSNR, dB (thin_stream)")
+        place.set_title(f"PSNR, dB ({scene})")
     return figure
 
 
@@ -365,6 +370,7 @@ CHARTS: dict[str, Callable[[], Figure]] = {
     "transport": transport,
     "told_nothing": told_nothing,
     "quality_over_time": quality_over_time,
+    "quality_over_time_600x400": partial(quality_over_time, "quality_over_time_600x400"),
     "capacity": capacity,
     "whole_fit": whole_fit,
 }

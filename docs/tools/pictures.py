@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from splashbench.background.clean_plate import make_clean_plates
+from splashbench.background.depth import depth_maps
+from splashbench.container.footage_vessel import standing_about_liquid
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
 from splashbench.dyes import DYES
@@ -220,6 +223,40 @@ def vessels() -> list[Path]:
     return [store(figure, "method_vessel.png", 130)]
 
 
+def standing() -> list[Path]:
+    """What speaks for the container in two scenes: heights in the clean plates, and liquid that rests in glass. And the
+    vessels found."""
+    figure = Figure(figsize=(10, 1.8), layout="constrained")
+    panels = iter(figure.subplots(1, 4))
+    for name, timesteps in (("opaque_bowl", 8), ("glass_tank", 50)):
+        folder = WORK / f"{name}_without_masks"
+        size, steps = ("--size", "480x320"), ("--timesteps", str(timesteps))
+        made(folder, "synth", "scene", name, str(folder), *size, *steps, "--times-alone")
+        scene = Scene.open(folder).training()
+        plates = make_clean_plates(scene)
+        found = standing_about_liquid(scene, plates)
+        assert found.support is not None
+        assert found.vessel is not None
+        view = scene.train[1]
+        mask = found.vessel.masks([scene.cameras[view]])[view]
+        room = window(mask, 60)
+        if found.vessel.seen_through:
+            later = range(scene.n_frames // 2, scene.n_frames)
+            wet = np.mean([scene.mask(view, t) for t in later], axis=0)
+            bare(next(panels)).imshow(wet[room], cmap="viridis", vmin=0, vmax=1)
+        else:
+            depth = depth_maps(scene.initial_points(), list(plates.values()))[1]
+            heights = np.where(depth.trusted, found.support.heights(depth.lifted()), np.nan)
+            # The sweep sees plates of its own size.
+            scale = heights.shape[0] / mask.shape[0]
+            part = tuple(slice(round(side.start * scale), round(side.stop * scale)) for side in room)
+            bare(next(panels)).imshow(heights[part], cmap="viridis", vmin=0, vmax=0.12)
+        picture = bare(next(panels))
+        picture.imshow(plates[view].image[room])
+        picture.contour(mask[room], levels=[0.5], colors=[BLUE], linewidths=1.2)
+    return [store(figure, "method_standing.png", 130)]
+
+
 def perturbations() -> list[Path]:
     """A training view with each kind of perturbation at its fourth severity; masks as outlines."""
     folder = WORK / "opaque_bowl_recorded"
@@ -404,6 +441,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "test_view": test_view,
     "method": method,
     "vessels": vessels,
+    "standing": standing,
     "rims": rims,
     "perturbations": perturbations,
     "tutorial": tutorial,

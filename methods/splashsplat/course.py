@@ -13,6 +13,7 @@ The parts' results are the same on any number of cores, which decide only what i
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
@@ -22,11 +23,13 @@ import numpy as np
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Decision, Run
 from splashbench.parallel import thread_count
+from splashbench.processes import resident_bytes
 from splashbench.render import Frozen, freeze
 from splashbench.scene.scene import TrainingScene
 from splashbench.selfcalibration import self_calibration
 
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
+from .affordable_memory import within_memory
 from .appearance.warm_start import Learned
 from .coarse_fit import begins_on_coarse_grids, fit_coarsely
 from .draft import State, make_draft
@@ -64,6 +67,8 @@ class Course:
     ) -> None:
         self._scene, self._config, self._run = scene, config, run
         self._show = show if run.watched else None
+        # Of the process before the fit, which a budget of memory has to know.
+        self._loaded = 0 if run.budget.memory_bytes is None else sum(resident_bytes(os.getpid()).values())
         self._known: KnownContainer | None = None
         self._plates: Callable[[], Plates] = _plates_of(scene)
         # Of its settings, those that a budget asks for.
@@ -104,7 +109,10 @@ class Course:
     def _container(self) -> KnownContainer:
         """Looked for once, for all traces."""
         if self._known is None:
-            self._known = known_container(self._scene, self._config.container, self._config.container_masks)
+            config = self._config
+            plates = self._plates if config.container_footage else None
+            with self._run.stage("container"):
+                self._known = known_container(self._scene, config.container, config.container_masks, plates)
         return self._known
 
     def _stand_in(self) -> Backgrounds:
@@ -230,16 +238,18 @@ class Course:
         together = self._config.composition == "together"
         deferred = self._config.plates_share > 0 and not together
         behind: Backgrounds = self._stand_in() if deferred else {}
-        # Every trace on the way to the one that is kept asks for it.
-        known = self._container() if run.budget.limits else self._known
+        # For every trace on the way to the one that is kept; before the background, as both make clean plates.
+        known = self._container()
         spent = within_seconds(self._scene, self._config, run, known)
         self._config = spent.config
         self._smaller_background = background_update(self._config, run)
 
         def trace(part: Run) -> Traced:
-            return within_bytes(
-                self._config, part, lambda coarser: trace_liquid(self._scene, coarser, part, known), spent.traced
-            )
+            def on(config: SplashSplatConfig) -> Traced:
+                return trace_liquid(self._scene, config, part, known)
+
+            first = within_memory(self._scene, self._config, part, self._loaded, on, spent.traced)
+            return within_bytes(self._config, part, on, first)
 
         late, traced = run.ahead(self._fitted_background, trace, (0, _BEFORE))
         if deferred:

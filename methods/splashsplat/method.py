@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
+from splashbench.errors import SplashbenchError
 from splashbench.gaussians.devices import CPU, GaussianMethod
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Fitted, Render, Run, Support
@@ -187,7 +188,7 @@ class SplashSplat(GaussianMethod):
     id: ClassVar[str] = "splashsplat"
     title: ClassVar[str] = "SplashSplat"
     version: ClassVar[str] = VERSION
-    budgets: ClassVar[tuple[str, ...]] = ("seconds", "storage_bytes")
+    budgets: ClassVar[tuple[str, ...]] = ("seconds", "storage_bytes", "memory_bytes")
     torch_optim: ClassVar[bool] = False
     Config = SplashSplatConfig
 
@@ -199,14 +200,23 @@ class SplashSplat(GaussianMethod):
         return Support(True)
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:
-        """The parts of the fit, in the order of course.py."""
+        """The parts of the fit, in the order of course.py.
+
+        Raises SplashbenchError for a budget of memory elsewhere than on the processor: it was not measured there.
+        """
+        if run.budget.memory_bytes is not None and run.device != CPU:
+            raise SplashbenchError("splashsplat keeps to a budget of memory on the processor alone; give --device cpu")
         if config.variant == "flip":
             metric_gravity(scene)  # an error now rather than after the background
 
         def show(state: Callable[[], State], milestone: bool) -> None:
             run.checkpoint(lambda: FittedSplashSplat(*state()), milestone)
 
-        return FittedSplashSplat(*Course(scene, config, run, show).taken())
+        fitted = FittedSplashSplat(*Course(scene, config, run, show).taken())
+        carriers, handed_out = fitted.liquid.carriers.count, len(fitted.liquid.handed_out)
+        if handed_out < carriers:
+            run.note("particles", f"{handed_out} of {carriers} carriers: a file holds no more of them")
+        return fitted
 
     def load(self, directory: Path, scene: TrainingScene) -> FittedSplashSplat:
         """Read a saved model."""

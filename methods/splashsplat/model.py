@@ -17,7 +17,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import compressed_bytes, read_json, read_npz, write_json, write_npz
 from splashbench.observe.grid import Grid
 from splashbench.scene.geometry import MAX_BYTES, SignedDistance
-from splashbench.scene.particles import Particles
+from splashbench.scene.particles import Particles, even_share, most_particles
 from splashbench.scene.velocity import VelocityField
 
 from .appearance.decoder import Decoder, DecoderSettings
@@ -133,19 +133,30 @@ class Liquid:
         """The carriers at any time."""
         return Track(self.grid, self.carriers, self.motion, self.phi)
 
+    @property
+    def handed_out(self) -> np.ndarray:
+        """Numbers of the carriers that `particles` has, ascending, int64 [n]."""
+        return even_share(self.carriers.count, most_particles(self.carriers.n_frames))
+
     def particles(self) -> Particles:
         """The carriers as particles, with the velocity of the liquid where they are, scene units per second.
 
-        Without velocities where others than the model's moved them (the variants FLIP and per-frame).
+        Without velocities where others than the model's moved them (the variants FLIP and per-frame). Where there are
+        more than a file of particles may hold, an even share of them.
         """
-        n_frames, count = self.carriers.n_frames, self.carriers.count
+        n_frames = self.carriers.n_frames
+        number = np.full(self.carriers.count, -1, dtype=np.int64)
+        handed_out = self.handed_out
+        count = len(handed_out)
+        number[handed_out] = np.arange(count)
         positions = np.zeros((n_frames, count, 3), dtype=np.float32)
         velocities = np.zeros_like(positions)
         active = np.zeros((n_frames, count), dtype=bool)
         for t in range(n_frames):
             rows = self.carriers.rows(t)
-            ids = self.carriers.ids[rows]
-            x = self.carriers.positions[rows]
+            ids = number[self.carriers.ids[rows]]
+            x = self.carriers.positions[rows][ids >= 0]
+            ids = ids[ids >= 0]
             positions[t, ids] = self.grid.to_scene(x)
             active[t, ids] = True
             if n_frames > 1 and len(ids):

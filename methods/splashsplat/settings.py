@@ -43,7 +43,7 @@ _COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "23"
+VERSION = "24"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -75,6 +75,8 @@ class SplashSplatConfig(MethodConfig):
     container: bool = True
     #: without a mesh: the upright vessel that fills the container masks, where the scene has them
     container_masks: bool = True
+    #: without mesh and container masks: the upright vessel that the footage shows where the liquid is
+    container_footage: bool = True
     #: liquid is cut by pixels where the near wall of an opaque container hides it (needs gravity or container masks)
     cut_at_rim: bool = True
     #: the box of the grids holds every frame's hull, or else the hull of all masks together; where failed masks are
@@ -284,6 +286,7 @@ class SplashSplatConfig(MethodConfig):
             "signed_distance": "carve",
             "container": False,
             "container_masks": False,
+            "container_footage": False,
             "cut_at_rim": False,
             "detect_failed_masks": False,
             "replace_empty_masks": False,
@@ -391,6 +394,7 @@ class SplashSplatConfig(MethodConfig):
             signed_distance=self.signed_distance,
             container=self.container,
             container_masks=self.container_masks,
+            container_footage=self.container_footage,
             cut_at_rim=self.cut_at_rim,
             detect_failed_masks=self.detect_failed_masks,
             replace_empty_masks=self.replace_empty_masks,

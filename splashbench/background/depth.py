@@ -9,6 +9,7 @@ the rest far behind.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -168,9 +169,15 @@ def _affine(at: NDArray, inverse: NDArray, uv: NDArray, distance: NDArray, aroun
 
 def common_target(cameras: list[Camera]) -> NDArray[np.float64]:
     """The point [3] nearest to the rays through all image centres, in the sense of least squares."""
+    return nearest_to_rays(cameras, np.array([[camera.width / 2, camera.height / 2] for camera in cameras]))
+
+
+def nearest_to_rays(cameras: Sequence[Camera], uv: NDArray) -> NDArray[np.float64]:
+    """The point [3] nearest to the rays through pixel positions [V, 2], one of each camera, in the sense of least
+    squares."""
     centers = np.stack([camera.center for camera in cameras])
-    middles = np.array([[camera.width / 2, camera.height / 2, 1.0] for camera in cameras])
-    rays = np.stack([camera.w2c[:3, :3].T @ np.linalg.solve(camera.K, uv) for camera, uv in zip(cameras, middles)])
+    homogeneous = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    rays = np.stack([camera.w2c[:3, :3].T @ np.linalg.solve(camera.K, at) for camera, at in zip(cameras, homogeneous)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     # The small term settles rays that are parallel: one unit before the cameras.

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Method
 from splashbench.harness.discovery import load_method
+from splashbench.manifest import load_neurofluid, load_scenes
+from splashbench.paper_figures import paper_rows
+from splashbench.scene import Scene
 from splashbench.study import stress
 from splashbench.study.plan import StudyPlan, make_plan
 from splashbench.study.spec import Paper, Reference, SceneEntry, StudySpec, StudyVariant
@@ -78,9 +82,13 @@ def make_benchmark_plan(
     *,
     seeds: Sequence[int] = (0,),
     device: str = "cpu",
+    gpu_elsewhere: bool | None = None,
     timeout_seconds: float | None = None,
 ) -> StudyPlan:
-    """The runs of `entrants` on `scenes`, and of the control `nothing` on each."""
+    """The runs of `entrants` on `scenes`, and of the control `nothing` on each.
+
+    device: "auto" for a GPU where a method and the machine can use one. gpu_elsewhere: see `make_plan`.
+    """
     nothing = load_method(NOTHING)
     settings = {SHRINKS: NATIVE_SIDE} if SHRINKS in nothing.Config.model_fields else {}
     settings |= stress.REFERENCE_SETTINGS
@@ -106,11 +114,21 @@ def make_benchmark_plan(
             for number, each in enumerate(entrants)
         ),
         reference=Reference(preset=preset_of(nothing, budget), settings=settings),
-        paper=Paper(scene_set="real_20"),
+        paper=_paper_of([Scene.open(Path(scene)).name for scene in scenes]),
         device=device,
         timeout_seconds=timeout_seconds,
     )
-    return make_plan(spec)
+    return make_plan(spec, gpu_elsewhere)
+
+
+def _paper_of(scenes: Sequence[str]) -> Paper | None:
+    """The paper's figures that stand beside these scenes, by their names: its means over the real ones, or those of one
+    of NeuroFluid's. Other scenes have none."""
+    if set(scenes) <= set(load_scenes()):
+        return Paper(scene_set="real_20")
+    names = {scene.lower() for scene in scenes if scene in load_neurofluid().scenes}
+    reported = {str(row["scene_set"]) for row in paper_rows()}
+    return Paper(scene_set=names.pop()) if len(names) == len(set(scenes)) == 1 and names <= reported else None
 
 
 def _plain(entrants: Sequence[Entrant], number: int) -> str:

@@ -82,6 +82,14 @@ class Machine:
     factor: float
     probe_seconds: float | None = None
 
+    def share(self, cores: int) -> float:
+        """How fast a run with `cores` of its cores is, against one with all."""
+        return _effective(cores) / _effective(self.cores)
+
+    def alone(self, at_once: int) -> float:
+        """What share of its time a run would take with all cores to itself that was one of `at_once`."""
+        return self.share(max(1, self.cores // at_once))
+
 
 def measure_machine(rates: Rates) -> Machine:
     """Measure this machine by a render, in processor time: what else runs here is not counted."""
@@ -131,7 +139,7 @@ class MethodEstimate:
 
 @dataclass
 class Estimate:
-    """What a plan takes. disk_bytes: in the folder."""
+    """What the runs that are left take. disk_bytes: in the folder."""
 
     methods: list[MethodEstimate]
     scenes: int
@@ -142,6 +150,15 @@ class Estimate:
     def seconds(self) -> float:
         """Of all known runs that are left, one after another."""
         return sum(each.seconds or 0.0 for each in self.methods)
+
+    def seconds_at_once(self, jobs: int, cores: int | None = None) -> float:
+        """The same for `jobs` runs at a time, of `cores` threads each; None for as many as each has to itself.
+
+        More runs at a time gain what a machine's further cores are worth to a run of their own: nothing on two cores.
+        """
+        there = self.machine.cores
+        each = min(cores or max(1, there // jobs), there)
+        return self.seconds / (self.machine.share(each) * min(jobs, there / each))
 
     @property
     def memory_bytes(self) -> float:
@@ -195,7 +212,7 @@ def _row(
     machine: Machine,
     with_lpips: bool,
 ) -> tuple[MethodEstimate, float]:
-    """The estimate of a row, and bytes that it leaves on the disk."""
+    """The estimate of a row, and bytes that its runs that are left leave on the disk."""
     first = runs[0]
     method = load_method(first.method)
     config = method.Config.preset(first.preset, dict(first.overrides)).model_dump(mode="json")
@@ -210,15 +227,20 @@ def _row(
             expected = machine.factor * (_fit_seconds(recorded, config, shown, size) + _score(rates, size, with_lpips))
             row.memory_bytes = max(row.memory_bytes, _line(recorded.memory_points, shown))
             row.beyond = max(row.beyond, shown / recorded.points[-1][0])
-            disk += recorded.cache_bytes * size.timesteps / 50
         entry = store.entry(run.digest)
         if entry is not None and entry.status == "ok":
             row.made += 1
-            per_work.append(entry.seconds / max(size.test, 1e-6))
+            # Those that shared the machine had fewer cores.
+            seconds = entry.seconds * machine.alone(entry.at_once)
+            per_work.append(seconds / max(size.test, 1e-6))
             if expected:
-                ratios.append(entry.seconds / expected)
+                ratios.append(seconds / expected)
         else:
             left.append((expected, size.test))
+            if recorded is not None:
+                disk += recorded.cache_bytes * size.timesteps / 50
+            if first.method == NOTHING:  # references stay: others are measured against their renders
+                disk += size.test * rates.picture_bytes
     if not left:
         row.seconds, row.basis = 0.0, "all of its runs are there"
     elif ratios:
@@ -232,8 +254,6 @@ def _row(
         row.basis = f"{len(per_work)} of its runs, made here"
     else:
         row.seconds, row.basis = None, "nothing: no run of it was recorded, and none was made here yet"
-    if first.method == NOTHING:  # references stay: others are measured against their renders
-        disk += sum(sizes[run.scene.name].test for run in runs) * rates.picture_bytes
     return row, disk
 
 
@@ -259,7 +279,7 @@ def _line(points: Sequence[tuple[float, float]], x: float) -> float:
 
 
 def as_json(found: Estimate) -> dict:
-    """The estimate for programs."""
+    """The estimate for programs. seconds: one run after another, each with all cores."""
     return {
         "scenes": found.scenes,
         "runs_left": found.left,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -18,19 +19,30 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from splashbench import toml
 from splashbench.errors import SplashbenchError, one_line
-from splashbench.files import atomic_directory, list_files, validate_model, write_text
+from splashbench.files import atomic_directory, list_files, read_plain, validate_model, write_text
 from splashbench.manifest import load_scenes
 from splashbench.scene import Scene
 from splashbench.score import PROTOCOL_V1, Result
-from splashbench.version import __version__
 
 BENCHMARK_FILE, ENTRY_FILE, ENTRIES = "benchmark.toml", "entry.toml", "entries"
 WORKFLOW = ".github/workflows/benchmark.yml"
+#: Where the workflow finds splashbench, and how to put it there. No package index has splashbench: whoever took its
+#: name there would run code in the workflow.
+WHEELS, WHEEL = "wheels", "./wheels/splashbench-*.whl"
+MAKE_WHEEL = "python -m pip wheel --no-deps -w {} SPLASHBENCH"
 #: Of a benchmark: entries, and of an entry: files and bytes, submissions included.
 MAX_ENTRIES, MAX_FILES, MAX_BYTES = 2000, 20_000, 4 << 30
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,59}")
 _WEB = re.compile(r"https?://[^\s<>\"']{3,300}")
 _MAX_TEXT = 500
+# They stand in a shell script, in YAML and in Markdown, unquoted: letters that mean nothing in any of them, no more.
+_GIT = re.compile(r"git\+https://[A-Za-z0-9][A-Za-z0-9.-]*(:[0-9]+)?(/[A-Za-z0-9._~-]+)+@[A-Za-z0-9][A-Za-z0-9._/-]*")
+_WHEEL_FILE = re.compile(r"(\./)?(([A-Za-z0-9_][A-Za-z0-9._+-]*/)*[A-Za-z0-9_][A-Za-z0-9._+-]*\.whl)")
+_MAX_INSTALL, _MAX_WORKFLOW_BYTES = 300, 1 << 20
+# What workflows had that splashbench wrote before.
+_FROM_INDEX = re.compile(r"pip install [\"']?splashbench(?![\w/.-])")
+# The wheel that a workflow installs; its name may be a pattern.
+_INSTALLED = re.compile(r"pip install (?P<path>\./(?P<folder>(?:[\w+-][\w.+-]*/)*)(?P<name>[\w.+*-]+\.whl))\s")
 
 
 class _Strict(BaseModel):
@@ -215,12 +227,68 @@ def find_repeats(entries: Sequence[Entry]) -> None:
             first |= mine
 
 
-def init_benchmark(folder: Path, title: str, scenes: Sequence[Scene] = ()) -> list[Path]:
+def install_words(requirement: str | None) -> str:
+    """What the workflow gives `pip install`: `requirement`, or the wheel in WHEELS for None.
+
+    Raises SplashbenchError but for a git address with a tag or commit, and the path of a wheel in the repository.
+    """
+    if requirement is None:
+        return WHEEL
+    if len(requirement) <= _MAX_INSTALL:
+        if _GIT.fullmatch(requirement):
+            return requirement
+        wheel = _WHEEL_FILE.fullmatch(requirement)
+        if wheel:
+            return f"./{wheel[2]}"
+    raise SplashbenchError(
+        f"--install {requirement[:80]!r} cannot stand in a workflow; give git+https://HOST/PATH@TAG (or @COMMIT), or "
+        f"the path of a wheel in the repository, such as {WHEELS}/NAME.whl"
+    )
+
+
+def _origin(words: str) -> str:
+    """For README.md: where what the workflow installs comes from."""
+    if not words.endswith(".whl"):
+        return "For another version, change the tag there and in step 1 above."
+    place = words.rpartition("/")[0].removeprefix("./") or "."
+    return (
+        f"`{MAKE_WHEEL.format(place)}` puts that wheel there, where SPLASHBENCH is a clone of splashbench, or\n"
+        "`git+https://HOST/PATH@TAG`. A new version replaces the old wheel."
+    )
+
+
+def workflow_fault(folder: Path) -> str:
+    """Why the workflow of the benchmark in `folder` cannot install splashbench; empty where no fault is seen."""
+    path = Path(folder, WORKFLOW)
+    if not path.is_file():
+        return ""
+    text = read_plain(path, _MAX_WORKFLOW_BYTES).decode("utf-8", "replace")
+    if _FROM_INDEX.search(text):
+        return (
+            f"{path} asks a package index for splashbench, which none has: whoever takes its name runs code here; "
+            f"install {WHEEL} instead, made by `{MAKE_WHEEL.format(Path(folder, WHEELS))}` of a clone of splashbench"
+        )
+    found = _INSTALLED.search(text)
+    if found is None:
+        return ""
+    place = Path(folder, found["folder"])
+    count = sum(fnmatchcase(each.name, found["name"]) for each in place.iterdir()) if place.is_dir() else 0
+    if count == 1:
+        return ""
+    return (
+        f"{path} installs {found['path']}, of which there {'is none' if not count else f'are {count}'}; keep one wheel "
+        f"there, made by `{MAKE_WHEEL.format(place)}` of a clone of splashbench"
+    )
+
+
+def init_benchmark(folder: Path, title: str, scenes: Sequence[Scene] = (), install: str | None = None) -> list[Path]:
     """Write a new benchmark into `folder`, which may be a git repository without files; returns what was written.
 
     scenes: those that count, with their digests; the 20 released ones, by name, for none.
+    install: what its workflow gives `pip install`, see `install_words`.
     """
     folder = Path(folder)
+    words = install_words(install)
     if folder.is_dir() and any(path.name != ".git" for path in folder.iterdir()):
         raise SplashbenchError(f"{folder} holds files; give a new folder, or an empty git repository")
     title = one_line(title)
@@ -231,16 +299,18 @@ def init_benchmark(folder: Path, title: str, scenes: Sequence[Scene] = ()) -> li
     text = toml.dumps(values)
     template = files("splashbench.benchmark").joinpath("template")
     readme, workflow = (
-        template.joinpath(name).read_text(encoding="utf-8").replace("@VERSION@", __version__)
+        template.joinpath(name).read_text(encoding="utf-8").replace("@INSTALL@", words)
         for name in ("README.md", "workflow.yml")
     )
     contents = {
         BENCHMARK_FILE: text,
-        "README.md": readme.replace("@TITLE@", title),
+        "README.md": readme.replace("@WHEEL@", _origin(words)).replace("@TITLE@", title),
         WORKFLOW: workflow,
         f"{ENTRIES}/.gitkeep": "",
         ".gitignore": "/site/\n",
     }
+    if install is None:
+        contents[f"{WHEELS}/.gitkeep"] = ""
     if (folder / ".git").exists():
         for name, content in contents.items():
             write_text(folder / name, content)

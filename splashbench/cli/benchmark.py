@@ -77,9 +77,10 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--keep", action="store_true", help="keep every submission, with renders and model")
     parser.add_argument(
         "--device",
-        choices=("cpu", "auto"),
-        default="cpu",
-        help="auto: a GPU for the methods that can use one, where there is one with gsplat (default: cpu)",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="auto: a GPU for the methods that can use one, where there is one with gsplat; cuda: a GPU for every "
+        "method, each of which has to use it (default: auto)",
     )
     add_machines(parser)
     add_lpips_weights(parser)
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.benchmark.estimate import as_json, estimate, load_rates, measure_machine
     from splashbench.benchmark.scenes import find_scenes
     from splashbench.score.image.lpips import load_lpips
-    from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed, gpu_elsewhere
     from splashbench.study.job import Store
 
     scenes = find_scenes(arguments.scenes)
@@ -103,12 +104,13 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.budget,
         seeds=list(dict.fromkeys(arguments.seeds)) or [0],
         device=arguments.device,
+        gpu_elsewhere=gpu_elsewhere(arguments.on, arguments.device),
         timeout_seconds=60 * arguments.timeout if arguments.timeout else None,
     )
     rates, store = load_rates(), Store(arguments.out)
     with_lpips = load_lpips(arguments.lpips_weights)[0] is not None
     found = estimate(plan, store, rates, measure_machine(rates), with_lpips)
-    _tell(found, entrants, arguments.jobs or 1, arguments.device)
+    _tell(found, entrants, plan, arguments)
     if not with_lpips:
         say("LPIPS will be null: `splashbench download lpips-weights` fetches its weights, once")
     if arguments.dry_run:
@@ -163,22 +165,33 @@ def _report(plan: StudyPlan, store: Store, arguments: argparse.Namespace) -> tup
     board = arguments.out / "leaderboard"
     if not any(store.results.glob("*.json")):
         raise SplashbenchError(f"no run of {arguments.out} has a result; see the lines above, and {files[0]}")
-    if run_within(["leaderboard", str(store.results), str(board), "--with-paper"]):
+    paper = ["--with-paper"] if plan.spec.paper else []
+    if run_within(["leaderboard", str(store.results), str(board), *paper]):
         raise SplashbenchError(f"the leaderboard of {store.results} was not made; see the lines above")
     return len(means.failed), [*files, board / "index.html"]
 
 
-def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> None:
+def _tell(found: Estimate, entrants: list[Entrant], plan: StudyPlan, arguments: argparse.Namespace) -> None:
     """The estimate for people: one line, then what it rests on, method by method."""
+    from splashbench.harness.devices import CPU
     from splashbench.harness.estimates import duration
 
-    seconds = found.seconds / jobs
+    jobs, elsewhere = arguments.jobs or 1, arguments.on is not None
+    seconds = found.seconds_at_once(1 if elsewhere else jobs, arguments.cores or (1 if elsewhere else None))
+    memory = found.memory_bytes * (1 if elsewhere else jobs)
     unknown = f", and {', '.join(found.unknown)}, of which nothing is known" if found.unknown else ""
     say(
         f"{found.scenes} scene{'' if found.scenes == 1 else 's'}, {len(found.methods)} methods with the control, "
         f"{found.left} runs to make: about "
-        f"{_long(seconds)}{unknown}; {found.memory_bytes / 1e9:.1f} GB of memory, {_disk(found.disk_bytes)} on the disk"
+        f"{_long(seconds)}{unknown}; {memory / 1e9:.1f} GB of memory, {_disk(found.disk_bytes)} on the disk"
     )
+    if elsewhere:
+        say(
+            "That is one run at a time, with the threads of --cores (1), on a machine like this one; Ray says how many "
+            "it has room for at once"
+        )
+    for line in _lacking(0 if elsewhere else memory, found.disk_bytes, arguments.out, jobs):
+        say(line)
     rows = [
         [
             each.label,
@@ -196,7 +209,7 @@ def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> N
         f"This rests on the lines above, times {found.machine.factor:.2f} for this machine ({found.machine.cores} "
         "cores), by a render. Expect it to be off by a factor of two; with every run that is made it gets better."
     )
-    if device != "cpu":
+    if any(run.device != CPU for run in plan.runs):
         say("The estimate is for the processor: at 600x400 an H100 took a sixth of the time (docs/gpu.md)")
     native = [each.label for each in entrants if each.native]
     if native:
@@ -207,6 +220,25 @@ def _tell(found: Estimate, entrants: list[Entrant], jobs: int, device: str) -> N
             f"{', '.join(own)}: its own settings show it the liquid's photographs at their size; those of the "
             "background are shrunk, to 400 pixels in `quick` and 800 in `best`, which is its own handicap"
         )
+
+
+def _lacking(memory: float, disk: float, out: Path, jobs: int) -> list[str]:
+    """A line for what this machine has less of than the estimate asks for, in bytes."""
+    import shutil
+
+    import psutil
+
+    lines = []
+    if memory > psutil.virtual_memory().total:
+        lines.append(
+            f"That is more memory than the {psutil.virtual_memory().total / 1e9:.1f} GB of this machine: "
+            + ("give fewer --jobs" if jobs > 1 else "leave out the method that takes most, or take another machine")
+        )
+    place = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
+    free = shutil.disk_usage(place).free
+    if disk > free:
+        lines.append(f"That is more than the {free / 1e9:.1f} GB that are free at {place}: give OUT on a larger disk")
+    return lines
 
 
 def _long(seconds: float) -> str:
@@ -225,7 +257,7 @@ def _command(arguments: argparse.Namespace) -> str:
     """The command line that makes the benchmark again."""
     words = ["splashbench", "benchmark", "run", str(arguments.out)]
     words += ["--budget", arguments.budget]
-    words += ["--device", arguments.device] if arguments.device != "cpu" else []
+    words += ["--device", arguments.device] if arguments.device != "auto" else []
     for flag in ("scenes", "methods", "seeds"):
         values = getattr(arguments, flag)
         words += [f"--{flag}", *map(str, values)] if values else []

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _INIT = """\
   splashbench benchmark init BENCHMARK                                  a benchmark of the 20 released scenes
   splashbench benchmark init BENCHMARK --title "Pours" --scenes SCENES  of scenes of your own
+  splashbench benchmark init BENCHMARK --install git+https://HOST/PATH@TAG
 """
 _CHECK = """\
   splashbench benchmark check BENCHMARK                                 what a pull request hands in
@@ -49,6 +50,12 @@ def register(actions: argparse._SubParsersAction) -> None:
         default=[],
         metavar="DIR",
         help="scenes, or folders of some, whose digests are noted (default: the 20 released ones, by name)",
+    )
+    init_parser.add_argument(
+        "--install",
+        metavar="REQUIREMENT",
+        help="what the workflow installs: git+https://HOST/PATH@TAG (or @COMMIT), or a wheel's path in the repository "
+        "(default: the wheel in wheels/, which you put there)",
     )
     check_parser = add_command(
         actions,
@@ -83,14 +90,17 @@ that is at hand is scored again: that finds edited results, not forged renders.
 
 def init(arguments: argparse.Namespace) -> int:
     """Handle `splashbench benchmark init`."""
-    from splashbench.benchmark.repository import init_benchmark
+    from splashbench.benchmark.repository import MAKE_WHEEL, WHEELS, init_benchmark, install_words
     from splashbench.benchmark.scenes import find_scenes
     from splashbench.scene import Scene
 
+    install_words(arguments.install)  # before scenes are read
     scenes = [Scene.open(path) for path in find_scenes(arguments.scenes)]
-    files = init_benchmark(arguments.folder, arguments.title, scenes)
+    files = init_benchmark(arguments.folder, arguments.title, scenes, arguments.install)
     for file in files:
         say(f"wrote {file}")
+    if arguments.install is None:
+        say(f"next: `{MAKE_WHEEL.format(arguments.folder / WHEELS)}` of a clone of splashbench, for the workflow")
     say(f"next: `git init`, commit, push; others hand in as {arguments.folder / 'README.md'} says")
     if arguments.json:
         emit({"folder": str(arguments.folder), "files": [str(file) for file in files]})
@@ -99,14 +109,25 @@ def init(arguments: argparse.Namespace) -> int:
 
 def check(arguments: argparse.Namespace) -> int:
     """Handle `splashbench benchmark check`."""
-    from splashbench.benchmark.repository import read_benchmark, read_entries
+    from splashbench.benchmark.repository import read_benchmark, read_entries, workflow_fault
+    from splashbench.errors import one_line
 
     entries = read_entries(arguments.folder, read_benchmark(arguments.folder), with_scenes=False)
     faulty = _tell_faults(entries, "error")
+    unfit = one_line(workflow_fault(arguments.folder))
+    if unfit:  # no fault of who hands in
+        say(f"warning: {unfit}")
     results = sum(len(entry.results) for entry in entries)
     say(f"{len(entries)} entries, {results} results, {len(faulty)} entries with faults")
     if arguments.json:
-        emit({"entries": len(entries), "results": results, "faults": {e.name: e.faults for e in faulty}})
+        emit(
+            {
+                "entries": len(entries),
+                "results": results,
+                "faults": {e.name: e.faults for e in faulty},
+                "workflow": unfit,
+            }
+        )
     return 1 if faulty else 0
 
 

@@ -208,7 +208,7 @@ def _stress_command(arguments: argparse.Namespace) -> str:
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench study run`."""
     from splashbench.harness.runner import parse_overrides
-    from splashbench.study.execution import ExecutionOptions, carry_out_plan
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan, gpu_elsewhere
     from splashbench.study.job import Store
     from splashbench.study.plan import make_plan
     from splashbench.study.report import as_json, write_report
@@ -220,7 +220,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     for name in arguments.only or []:
         spec.variant(name)
-    plan = make_plan(spec)
+    plan = make_plan(spec, gpu_elsewhere(arguments.on, spec.device))
     options = ExecutionOptions(
         only=tuple(arguments.only) if arguments.only else None,
         **machine_options(arguments),

@@ -35,7 +35,7 @@ def add_machines(parser: argparse.ArgumentParser) -> None:
         "--gpus",
         type=whole_number(0),
         metavar="N",
-        help="with --on: GPUs of each run (default: 1 where the device is cuda, else 0)",
+        help="with --on: GPUs of each run whose method uses one (default: 1)",
     )
     group.add_argument(
         "--memory",

@@ -25,7 +25,8 @@ examples:
   splashbench view submissions/a --show particles cameras
 
 On a machine without a screen: run it there with --no-open, and on yours `ssh -L 8080:localhost:8080 MACHINE`, then open
-http://localhost:8080. Two halves take three ports, which the command names. It needs `pip install 'splashbench[view]'`.
+http://localhost:8080. Two halves take three ports, which the command names. It needs the extra `view`,
+in a checkout: pip install -c constraints.txt -e '.[view]'
 Layers for --show: liquid, background, particles, surface, cut, velocity, picture, container, points, cameras, grid.
 """
 

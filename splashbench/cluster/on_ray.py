@@ -64,7 +64,7 @@ class RayWorkers:
         self._ray = _import_ray()
         self._address, self._at_once, self._modules = address, at_once, tuple(modules)
         self._folder, self._inputs, self._needs, self._tell = folder, inputs, needs, tell
-        self._running: dict[Any, str] = {}
+        self._running: dict[Any, Work] = {}
         self._machines: list[dict[str, Any]] = []
         self._looked = self._had_room = time.monotonic()
         self._exit = contextlib.ExitStack()
@@ -73,7 +73,7 @@ class RayWorkers:
     def __enter__(self) -> RayWorkers:
         with contextlib.ExitStack() as stack:
             stack.callback(self._ray.shutdown)
-            self._connect()
+            _connect(self._ray, self._address)
             self._asked = stack.enter_context(shared(self._folder, self._inputs))
             # Not as many calls as one likes, which Ray's default would be 1 of for work that has a GPU: it is the
             # worker that uses it, and gives it back.
@@ -96,8 +96,12 @@ class RayWorkers:
     def room(self, needs: Needs) -> int:
         if time.monotonic() - self._looked > _LOOK_SECONDS:
             self._look()
-        there = sum(_fits(machine, needs) for machine in self._machines)
-        room = min(there, self._at_once or there) - len(self._running)
+        there, without = (self._capacity(each) for each in (needs, replace(needs, gpus=0)))
+        # All that runs takes cores; what has no GPU takes none away.
+        with_gpus = sum(work.needs.gpus > 0 for work in self._running.values())
+        room = min(without, self._at_once or without) - len(self._running)
+        if needs.gpus:
+            room = min(room, there - with_gpus)
         if there:
             self._had_room = time.monotonic()
         elif not self._running and time.monotonic() - self._had_room > _PATIENCE_SECONDS:
@@ -105,8 +109,15 @@ class RayWorkers:
             self._had_room = time.monotonic() + 5 * _PATIENCE_SECONDS
         return room
 
+    def _capacity(self, needs: Needs) -> int:
+        """How many pieces of work of these needs all machines have room for when nothing runs."""
+        return sum(_fits(machine, needs) for machine in self._machines)
+
     def sharing(self, needs: Needs) -> int:
-        return max(1, *(min(_fits(machine, needs), self._at_once or sys.maxsize) for machine in self._machines))
+        # Whoever has no GPU shares the machine, too.
+        without = replace(needs, gpus=0)
+        shares = (min(_fits(machine, without), self._at_once or sys.maxsize) for machine in self._machines)
+        return max(1, max(shares, default=1))
 
     def start(self, work: Work) -> None:
         needs = work.needs
@@ -117,7 +128,7 @@ class RayWorkers:
         # Ray's processes hold work to one thread where it does not say how many.
         given = {**passed_on(), **thread_limits(_cores(needs)), **work.environment}
         reference = task.remote(replace(work, environment=given), self._modules, self._folders, self._asked)
-        self._running[reference] = work.key
+        self._running[reference] = work
 
     def wait(self) -> list[Ended]:
         if not self._running:
@@ -126,7 +137,7 @@ class RayWorkers:
         ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=_WAIT_SECONDS)
         ended = []
         for reference in ready:
-            key = self._running.pop(reference)
+            key = self._running.pop(reference).key
             try:
                 answer = self._ray.get(reference)
             except self._ray.exceptions.RayTaskError as error:
@@ -139,28 +150,6 @@ class RayWorkers:
                 raise SplashbenchError(answer)
             ended.append(answer)
         return ended
-
-    def _connect(self) -> None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        # It tells that a cluster of this machine alone has a token, which it makes and reads by itself.
-        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-        quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "include_dashboard": None}
-        with _in_own_folder(), _own_signals():
-            try:
-                if self._address is not None:
-                    _require_listener(self._address)  # Ray would try for minutes
-                    self._ray.init(self._address, **quiet)
-                    return
-                try:
-                    self._ray.init("auto", **quiet)
-                except ConnectionError:
-                    self._ray.init("local", **{**quiet, "include_dashboard": False})
-            except Exception as error:
-                where = self._address or "this machine"
-                raise SplashbenchError(
-                    f"no Ray cluster answers at {where} ({_last_line(error)}); start one with `ray start --head`, and "
-                    "give the HOST:PORT that it prints, with the same RAY_AUTH_MODE (docs/study.md, many machines)"
-                ) from None
 
     def _require_machines(self) -> None:
         """Raise SplashbenchError where no machine has room for the work, or one does not share the files."""
@@ -200,14 +189,62 @@ class RayWorkers:
 
     def _look(self) -> None:
         """See which machines there are."""
+        self._looked, self._machines = time.monotonic(), _alive(self._ray)
+
+
+def cluster_has_gpu(address: str | None) -> bool | None:
+    """Whether a machine of the cluster has a GPU; None where there is no cluster, and Ray would be this machine alone.
+
+    address: as of `RayWorkers`. Raises SplashbenchError without Ray, and where no cluster answers at an address.
+    """
+    ray = _import_ray()
+    try:
+        if not _connect(ray, address, or_here=False):
+            return None
+        return any(machine["Resources"].get("GPU", 0) >= 1 for machine in _alive(ray))
+    finally:
+        ray.shutdown()
+
+
+def _connect(ray: Any, address: str | None, or_here: bool = True) -> bool:
+    """Join the cluster at `address`, or the one of this machine; returns whether there is one.
+
+    or_here: where this machine has none, start Ray on it alone.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # It tells that a cluster of this machine alone has a token, which it makes and reads by itself.
+    logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "include_dashboard": None}
+    with _in_own_folder(), _own_signals():
         try:
-            machines = [machine for machine in self._ray.nodes() if machine["Alive"]]
+            if address is not None:
+                _require_listener(address)  # Ray would try for minutes
+                ray.init(address, **quiet)
+                return True
+            try:
+                ray.init("auto", **quiet)
+            except ConnectionError:
+                if or_here:
+                    ray.init("local", **{**quiet, "include_dashboard": False})
+                return False
+            return True
         except Exception as error:
+            where = address or "this machine"
             raise SplashbenchError(
-                f"the Ray cluster does not answer any more ({_last_line(error)}); start it, and give the same command "
-                "again, which goes on"
+                f"no Ray cluster answers at {where} ({_last_line(error)}); start one with `ray start --head`, and "
+                "give the HOST:PORT that it prints, with the same RAY_AUTH_MODE (docs/study.md, many machines)"
             ) from None
-        self._looked, self._machines = time.monotonic(), machines
+
+
+def _alive(ray: Any) -> list[dict[str, Any]]:
+    """The cluster's machines."""
+    try:
+        return [machine for machine in ray.nodes() if machine["Alive"]]
+    except Exception as error:
+        raise SplashbenchError(
+            f"the Ray cluster does not answer any more ({_last_line(error)}); start it, and give the same command "
+            "again, which goes on"
+        ) from None
 
 
 def _require_listener(address: str) -> None:
@@ -223,7 +260,8 @@ def _import_ray() -> Any:
         import ray.util.scheduling_strategies
     except ImportError:
         raise SplashbenchError(
-            "Ray is not installed; pip install 'splashbench[cluster]' on every machine, or run without --on"
+            "Ray is not installed; in a checkout that all machines see: pip install -c constraints.txt -e '.[cluster]',"
+            " or run without --on"
         ) from None
     return ray
 

@@ -39,6 +39,17 @@ def workers_at(
     return RayWorkers(address, at_once, modules, folder, inputs, needs, tell)
 
 
+def has_gpu(place: str) -> bool | None:
+    """Whether a machine of the cluster at `place` has a GPU; None where no cluster runs, and it is this machine alone.
+
+    Raises SplashbenchError where no cluster answers at the address, and without Ray.
+    """
+    address = ray_address(place)
+    from splashbench.cluster.on_ray import cluster_has_gpu
+
+    return cluster_has_gpu(address)
+
+
 def ray_address(place: str) -> str | None:
     """HOST:PORT of "ray://HOST:PORT"; None of "ray". Raises SplashbenchError for what is neither."""
     if place == "ray":

@@ -14,12 +14,11 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import files_together, require_file_place, require_folder_place, write_model
 from splashbench.scene import Camera, Scene
 from splashbench.scene.container import ContainerMesh
+from splashbench.scene.container_masks import require_same_pose
 from splashbench.scene.layout import SceneMeta, plain_name
 
 #: Below this overlap of mesh and mask a camera is worth a look; below it on the median, a scan is of another container.
 LEAST_OVERLAP = 0.8
-# Extrinsics of the same camera, with and without a crop, agree to this.
-_SAME_POSE = 1e-6
 
 
 def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArray[np.bool_]], dict[str, Camera]]:
@@ -41,12 +40,7 @@ def masks_of(scene: Scene, masked: Scene | None = None) -> tuple[dict[str, NDArr
             raise SplashbenchError(
                 f"{path}: the mask is {'full' if mask.all() else 'empty'}; draw the container, or leave the file out"
             )
-        poses = scene.cameras[name].w2c, masked.cameras[name].w2c
-        if not np.allclose(*poses, atol=_SAME_POSE * max(1.0, float(np.abs(poses[0]).max()))):
-            raise SplashbenchError(
-                f"{masked.directory}: camera {name} stands elsewhere than in {scene.directory}; give the same scene's"
-                " folder before it was cropped"
-            )
+        require_same_pose(scene, masked, name)
         masks[name] = mask
     training = sum(name in scene.train for name in masks)
     if training < 2:

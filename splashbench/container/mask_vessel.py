@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 
 from splashbench.arrays import Floats
 from splashbench.container.mask_kernels import least_within, overlap
+from splashbench.container.vessel_body import Vessel, VesselBody, frame_about, superellipse
 from splashbench.observe.container import depth_image, nearest_drawn
 from splashbench.scene import Camera
 from splashbench.scene.container import ContainerMesh
@@ -53,70 +54,10 @@ _ABOVE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class VesselBody:
-    """Rings of one outline along an axis, scene units.
+class MaskedVessel(Vessel):
+    """A vessel that fills masks. cover: overlap (intersection over union) of its silhouettes and these, per camera."""
 
-    middle: [3] the axis's point of height 0. frame: [3, 3], two unit vectors across the axis, and the axis. outline:
-    [angles, 2] points of the ring of radius 1. heights, radii: [K] of the rings.
-    """
-
-    middle: Floats
-    frame: Floats
-    outline: Floats
-    heights: Floats
-    radii: Floats
-
-    def rings(self, radii: Floats) -> Floats:
-        """Points [K, angles, 3] of rings of `radii` [K] at the heights."""
-        middles = self.middle + self.heights[:, None] * self.frame[2]
-        points: Floats = middles[:, None] + radii[:, None, None] * (self.outline @ self.frame[:2])
-        return points
-
-    def part(self, first: int, last: int) -> VesselBody:
-        """Without the rings below number `first` and from `last` on."""
-        return VesselBody(self.middle, self.frame, self.outline, self.heights[first:last], self.radii[first:last])
-
-    def mesh(self) -> ContainerMesh:
-        """The surface, with a floor and without a lid."""
-        points = self.rings(self.radii)
-        count, angles = points.shape[:2]
-        floor = self.middle + self.heights[0] * self.frame[2]
-        here = np.arange(count * angles).reshape(count, angles)
-        beside = np.roll(here, -1, axis=1)
-        faces = [
-            np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3),
-            np.stack([here[:-1], beside[1:], here[1:]], axis=-1).reshape(-1, 3),
-            np.stack([np.full(angles, count * angles), beside[0], here[0]], axis=-1),
-        ]
-        return ContainerMesh(np.vstack([points.reshape(-1, 3), floor]), np.concatenate(faces))
-
-
-@dataclass(frozen=True, eq=False)
-class MaskedVessel:
-    """The outside of a vessel, in scene units.
-
-    Attributes:
-        body: the surface, open at the rim.
-        cover: overlap (intersection over union) of its silhouettes and the masks, per camera.
-    """
-
-    body: VesselBody
     cover: dict[str, float]
-
-    @cached_property
-    def mesh(self) -> ContainerMesh:
-        """The surface, open at the rim."""
-        return self.body.mesh()
-
-    @property
-    def up(self) -> Floats:
-        """Unit vector [3] along the axis, from the foot to the rim."""
-        return self.body.frame[2]
-
-    @property
-    def rim(self) -> Floats:
-        """The ring [N, 3] at which the surface ends."""
-        return self.body.rings(self.body.radii)[-1]
 
     @property
     def trusted(self) -> bool:
@@ -192,7 +133,7 @@ def vessel_from_masks(
         return None
     best = None
     for up in (_held_up(used, start), *ups):
-        search = _Search(start, _frame_about(up), reach, views)
+        search = _Search(start, frame_about(up), reach, views)
         cover, at = search.best(np.array([0, 0, 0, 0, *_CIRCLE]), 4, _EVALUATIONS[0])
         if best is None or cover > best[0]:
             best = cover, at, search
@@ -247,15 +188,6 @@ def _held_up(cameras: Sequence[Camera], start: Floats) -> Floats:
     return np.asarray(-up if sense < 0 else up)
 
 
-def _frame_about(up: Floats) -> Floats:
-    """Three unit vectors [3, 3], the last along `up`."""
-    up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    first = np.eye(3)[int(np.argmin(np.abs(up)))]
-    first = first - (first @ up) * up
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(up, first), up])
-
-
 def _meeting_point(views: Sequence[_MaskView]) -> Floats:
     """The point [3] nearest to the rays through the middles of the masks."""
     total, right = np.zeros((3, 3)), np.zeros(3)
@@ -266,15 +198,6 @@ def _meeting_point(views: Sequence[_MaskView]) -> Floats:
         total += across
         right += across @ view.camera.center
     return np.asarray(np.linalg.lstsq(total, right, rcond=None)[0])
-
-
-def _superellipse(aspect: float, exponent: float, turn: float, points: int) -> Floats:
-    """Points [N, 2] of the outline |x / a|^p + |y a|^p = 1, a = exp(aspect), turned; corners are among them."""
-    angles = np.arange(points) * (2 * np.pi / points)
-    x, y = np.cos(angles), np.sin(angles)
-    length = (np.abs(x) ** exponent + np.abs(y) ** exponent) ** (-1 / exponent)
-    x, y = x * length * np.exp(aspect), y * length * np.exp(-aspect)
-    return np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +237,7 @@ class _Search:
     def body(self, numbers: Floats, rings: int, points: int) -> VesselBody | None:
         """The widest body within the masks; None where its axis misses them."""
         shift, tilt = 0.25 * self.reach * numbers[:2], numbers[2:4]
-        turned = _frame_about(self.frame[2] + tilt @ self.frame[:2])
+        turned = frame_about(self.frame[2] + tilt @ self.frame[:2])
         middle = self.start + shift @ self.frame[:2]
         along = np.linspace(-0.6 * self.reach, 0.6 * self.reach, 301)
         line = middle + along[:, None] * turned[2]
@@ -326,7 +249,7 @@ class _Search:
         high = int(breaks[breaks > nearest].min(initial=len(along))) - 1
         if not inside.any() or high - low < 3:
             return None
-        outline = _superellipse(float(numbers[4]), float(np.clip(numbers[5], 2, 30)), float(numbers[6]), points)
+        outline = superellipse(float(numbers[4]), float(np.clip(numbers[5], 2, 30)), float(numbers[6]), points)
         heights = np.linspace(along[low], along[high], rings)
         body = VesselBody(middle, turned, outline, heights, np.zeros(rings))
         lowest, highest = np.zeros(rings), np.full(rings, 0.6 * self.reach)

@@ -43,12 +43,19 @@ _MAX_PATH_BYTES = 4096
 
 
 class CheckedScene(BaseModel):
-    """A scene that `scene check` has read whole. files, bytes: what it consisted of then; faults: what was found."""
+    """A scene that `scene check` has read whole.
+
+    Attributes:
+        files, bytes: what it consisted of then, or once it had been given a container.
+        faults: what was found.
+        container: file of the container's mesh that its scene.json names.
+    """
 
     model_config = ConfigDict(extra="forbid")
     files: int = Field(ge=0)
     bytes: int = Field(ge=0)
     faults: list[str] = Field(default_factory=list)
+    container: str | None = None
 
 
 class _State(BaseModel):
@@ -197,13 +204,9 @@ def check_downloaded(out: Path, key: str, *, made: bool, again: bool, tell: Call
     size = (len(listing.names), listing.bytes)
     if known is None or again or made or (known.files, known.bytes) != size:
         tell(key)
-        known = CheckedScene(files=size[0], bytes=size[1], faults=[*listing.faults, *check_scene(place)])
-        # Another command may note scenes of its own in the same folder meanwhile, such as NeuroFluid's.
-        with alone(path, lambda _: None):
-            remove_leftovers([path])
-            state = _noted(path)
-            state.scenes[key] = known
-            write_model(path, state)
+        faults = [*listing.faults, *check_scene(place)]
+        known = CheckedScene(files=size[0], bytes=size[1], faults=faults, container=stated_container(place))
+        _note(path, key, known)
     report = SceneReport(
         name=place.name,
         variant="",
@@ -223,6 +226,38 @@ def check_downloaded(out: Path, key: str, *, made: bool, again: bool, tell: Call
         report.frames, report.times_source = scene.n_frames, scene.times_source
         report.seconds = float(scene.times[-1] - scene.times[0])
     return report
+
+
+def stated_container(place: Path) -> str | None:
+    """The file of the container's mesh that scene.json in `place` names; None where it names none or cannot be read."""
+    try:
+        meta = Scene.open(place).meta
+    except SplashbenchError:
+        return None
+    return None if meta is None else meta.container_mesh
+
+
+def note_container(out: Path, key: str) -> None:
+    """Note that the scene at `out`/`key`, which had been checked, has a container now; all else was read then.
+
+    Raises SplashbenchError where the container's mesh cannot be read.
+    """
+    path, place = out / STATE_FILE, out / key
+    listing, before = list_files(place), _noted(path).scenes.get(key)
+    faults = [] if before is None else before.faults
+    now = CheckedScene(files=len(listing.names), bytes=listing.bytes, faults=faults, container=stated_container(place))
+    if now != before:
+        Scene.open(place).container_mesh()
+        _note(path, key, now)
+
+
+def _note(path: Path, key: str, checked: CheckedScene) -> None:
+    # Another command may note scenes of its own in the same folder meanwhile, such as NeuroFluid's.
+    with alone(path, lambda _: None):
+        remove_leftovers([path])
+        state = _noted(path)
+        state.scenes[key] = checked
+        write_model(path, state)
 
 
 def _noted(path: Path) -> _State:

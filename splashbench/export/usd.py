@@ -39,7 +39,8 @@ class MeshStage:
             from pxr import Usd, UsdGeom, Vt
         except ImportError:
             raise SplashbenchError(
-                f"{path.name} needs the package usd-core; install splashbench[usd], or take --mesh-format ply"
+                f"{path.name} needs the package usd-core; in a checkout: pip install -c constraints.txt -e '.[usd]', "
+                "or take --mesh-format ply"
             ) from None
         self._vt, self._path = Vt, path
         fps = 1 / float(np.diff(times).min()) if len(times) > 1 else _FPS

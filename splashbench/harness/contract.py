@@ -293,7 +293,10 @@ class Fitted(ABC):
 
     @abstractmethod
     def particles(self) -> Particles | None:
-        """The liquid's particles on the scene's timesteps in scene units, or None for a method without any."""
+        """The liquid's particles on the scene's timesteps in scene units, or None for a method without any.
+
+        Of more rows than a file may hold (scene.particles.most_particles) an even share is kept, and a note says so.
+        """
 
     def signed_distance(self) -> SignedDistance | None:
         """The liquid's signed distance on the scene's timesteps, in scene units, or None for a method without one.

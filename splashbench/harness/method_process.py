@@ -25,6 +25,7 @@ from splashbench.harness.external.importers import Importer, load_importer
 from splashbench.harness.messages import Failure, Outcome, Request
 from splashbench.harness.output_checks import check_geometry, check_particles, checked_render
 from splashbench.scene import Camera, Scene, TrainingScene
+from splashbench.scene.particles import most_particles
 from splashbench.submission import Status, to_8bit, write_view
 from splashbench.submission.exr import write_exr
 
@@ -151,16 +152,22 @@ def _render(request: Request, method: Method | Importer, scene: TrainingScene, c
             )
     # On fewer timesteps than the scene's there is nothing to compare particles and distances with.
     bare = request.only_views or request.times is not None or request.training_views is not None
+    notes: dict[str, str] = {}
     particles = None if bare else fitted.particles()
     if particles is not None:
         check_particles(particles, scene.n_frames)
-        particles.save(output / "particles.npz")
+        # A fit is not lost for having more than a file may hold.
+        kept = particles.share(most_particles(scene.n_frames))
+        if kept.count < particles.count:
+            notes["particles"] = f"{kept.count} of {particles.count}, an even share: a file holds no more of them"
+        kept.save(output / "particles.npz")
     geometry = None if bare else fitted.signed_distance()
     if geometry is not None:
         check_geometry(geometry, scene.n_frames)
         geometry.save(output / "geometry.npz")
     counted = [count for count in counts if count is not None]
     return Outcome(
+        notes=notes,
         render_fps=_frame_rate(fitted, scene, request.timing_frames, channel),
         primitives_per_frame=statistics.fmean(counted) if counted else None,
         peak_device_memory_bytes=_device_peak(),

@@ -6,6 +6,7 @@ Here the run is measured: by the keeper's stamps, and by the files that are ther
 from __future__ import annotations
 
 import shutil
+from itertools import islice
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -21,6 +22,7 @@ from splashbench.harness.outputs import require_liquid, require_views, tree_dige
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene, TrainingScene
 from splashbench.submission import Checkpoint, Record, Status
+from splashbench.submission.identity import MAX_NOTES
 from splashbench.submission.submission import unusable_files
 
 
@@ -79,8 +81,10 @@ def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
     if faults:
         reason = one_line(f"what the method wrote is no submission: {faults[0]}").replace(f"{staging}/", "")
         return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
+    # The harness's own come first: a fit may have made as many notes as there may be, and under any name.
     return record.model_copy(
         update={
+            "notes": dict(islice((outcome.notes | record.notes | outcome.notes).items(), MAX_NOTES)),
             "checkpoints": checkpoints,
             "render_fps": outcome.render_fps,
             "timed_frames": request.timing_frames,

@@ -78,7 +78,9 @@ def available() -> str | None:
     try:
         gsplat = importlib.import_module("gsplat")
     except (ImportError, OSError, RuntimeError) as error:
-        return one_line(f"gsplat cannot be imported ({error}); pip install 'splashbench[cuda]'")
+        return one_line(
+            f"gsplat cannot be imported ({error}); in a checkout: pip install -c constraints.txt -e '.[cuda]'"
+        )
     # Wheels with compiled kernels add the versions of PyTorch and CUDA after a plus sign.
     version = str(getattr(gsplat, "__version__", "unknown"))
     if version.split("+")[0] != GSPLAT_VERSION:

@@ -15,6 +15,18 @@ from splashbench.files import atomic_path, read_npz
 MAX_BYTES = 1 << 30
 #: Rows of a file: each is sorted and looked at once per timestep.
 MAX_PARTICLES = 2_000_000
+# Of a row at an instant: position, velocity, whether it is active.
+_ROW_BYTES = 4 * 3 + 4 * 3 + 1
+
+
+def most_particles(n_frames: int) -> int:
+    """How many particles over `n_frames` instants, with velocities, a file may hold; it has a few headers besides."""
+    return min(MAX_PARTICLES, (MAX_BYTES - (1 << 16)) // (_ROW_BYTES * max(n_frames, 1)))
+
+
+def even_share(count: int, most: int) -> NDArray[np.int64]:
+    """Numbers of at most `most` of `count` rows, ascending and evenly apart, int64 [n]."""
+    return np.arange(count) if count <= most else np.arange(most) * count // most
 
 
 @dataclass
@@ -46,6 +58,19 @@ class Particles:
     def n_frames(self) -> int:
         """T, the number of instants."""
         return self.positions.shape[0]
+
+    @property
+    def count(self) -> int:
+        """N, the number of rows."""
+        return self.positions.shape[1]
+
+    def share(self, most: int) -> Particles:
+        """These where they are `most` rows or fewer, else an even share of them."""
+        if self.count <= most:
+            return self
+        rows = even_share(self.count, most)
+        velocities = None if self.velocities is None else self.velocities[:, rows]
+        return Particles(self.positions[:, rows], self.active[:, rows], velocities)
 
     def at(self, t: int) -> NDArray[np.float32]:
         """Positions [n, 3] of the particles that exist at instant `t`."""

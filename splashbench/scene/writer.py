@@ -54,12 +54,12 @@ def write_scene(
         if image.shape != (camera.height, camera.width, 3) or mask.shape != (camera.height, camera.width):
             raise ValueError(f"camera {name}, frame {t}: image {image.shape} or mask {mask.shape} is not {camera}")
         write_image(directory / "ims" / name / f"{t:06d}.{image_format}", image)
-        write_png(directory / "seg" / name / f"{t:06d}.png", _to_gray(mask))
+        write_png(directory / "seg" / name / f"{t:06d}.png", to_gray(mask))
         written.add((name, t))
     if len(written) != n_frames * len(shown):
         raise ValueError(f"{len(written)} of {n_frames * len(shown)} images were given")
     for name, mask in (container_masks or {}).items():
-        write_png(directory / "container_mask" / f"{name}.png", _to_gray(mask))
+        write_png(directory / "container_mask" / f"{name}.png", to_gray(mask))
     if initial_points is not None:
         with atomic_path(directory / "init_pt_cld.npz") as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, data=np.asarray(initial_points, dtype=np.float32))
@@ -72,7 +72,8 @@ def write_scene(
     write_model(directory / "scene.json", meta.model_copy(update={"sizes": sizes}))
 
 
-def _to_gray(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def to_gray(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """`mask` [H, W] as files have it: 255 where it is true."""
     return np.where(mask, 255, 0).astype(np.uint8)
 
 

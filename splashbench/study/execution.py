@@ -17,10 +17,11 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from splashbench.child import raise_if_disk_was_full
-from splashbench.cluster.place import workers_at
+from splashbench.cluster.place import has_gpu, workers_at
 from splashbench.cluster.work import Ended, Needs, Work, Workers
-from splashbench.errors import SplashbenchError
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import remove_any, require_folder_place, write_model, write_text
+from splashbench.harness.devices import AUTO, CPU
 from splashbench.harness.estimates import duration
 from splashbench.score.image.lpips import WEIGHTS_VARIABLE, load_lpips
 from splashbench.score.image.weights import weights_path
@@ -33,6 +34,10 @@ _MARK = ".splashbench_study"
 _TRIES = 5
 #: For an entry that another machine has written to be seen here.
 _ARRIVAL_SECONDS = 5.0
+#: Without a line for so long, the user is told how far runs are that are being made; so many of them.
+_SILENT_SECONDS, _SHOWN_RUNS, _LOG_TAIL_BYTES = 60.0, 3, 4096
+#: Runs that may wait for a machine of their kind while others start.
+_AHEAD = 100
 #: What the processes have imported that runs are forked off.
 _MODULES = ("splashbench.study.preload",)
 
@@ -46,7 +51,7 @@ class ExecutionOptions:
         jobs: runs at once; None for one here, and for as many as there is room for on Ray.
         on: where they are made, see `cluster.place.workers_at`; None for this machine.
         cores, memory_bytes: of a run, see `Needs`.
-        gpus: of a run that is no reference, on Ray; None for one where the study's device is cuda, else for none.
+        gpus: on Ray, of a run whose device is a GPU; None for one.
         keep: keep submissions, with renders and models.
         retry: run again what failed before.
         lpips_weights: see `splashbench.score.image.lpips.load_lpips`.
@@ -70,6 +75,16 @@ class ExecutionOptions:
     order: Callable[[Sequence[PlannedRun]], Iterator[PlannedRun]] | None = None
     pictures: bool = False
     training: bool = False
+
+
+def gpu_elsewhere(on: str | None, device: str) -> bool | None:
+    """Whether one of the machines at `on` (see `ExecutionOptions`) has a GPU, for a plan; None for this machine.
+
+    They are asked where `device` is "auto". Raises SplashbenchError where no cluster answers.
+    """
+    if on is None:
+        return None
+    return has_gpu(on) if device == AUTO else False
 
 
 @dataclass
@@ -103,17 +118,21 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
         total = len(references) + len(missing)
         chosen = iter(missing.values()) if options.order is None else options.order(list(missing.values()))
         with _workers(plan, store, options, total) as workers:
-            needs = _needs(plan, options)
-            sharing = workers.sharing(needs) if workers else 1
-            at_once = max(1, workers.room(needs)) if workers else 1
+            at_once = max(1, workers.room(_most_needed(plan, options))) if workers else 1
             progress = _Progress(total, options, _seconds_before(plan, store), at_once)
+
+            def made_ready(run: PlannedRun, is_reference: bool) -> tuple[Job, Needs]:
+                needs = _needs(run, is_reference, options)
+                sharing = workers.sharing(needs) if workers else 1
+                return _job(plan, run, store, options, is_reference, sharing), needs
+
             # First what others are measured against; it also fits the backgrounds that they share.
             for runs, is_reference in ((references, True), (chosen, False)):
-                jobs = (_job(plan, run, store, options, is_reference, sharing) for run in runs)
+                jobs = (made_ready(run, is_reference) for run in runs)
                 if workers is None:
-                    _run_here(jobs, store, progress)
+                    _run_here((job for job, _ in jobs), store, progress)
                 else:
-                    _run_all(jobs, replace(needs, gpus=0) if is_reference else needs, workers, store, progress)
+                    _run_all(jobs, workers, Needs(options.cores, 0, options.memory_bytes), store, progress)
         return Tally(progress.ended, len({run.digest for run in selected}) - len(missing))
 
 
@@ -126,16 +145,23 @@ def _weights(options: ExecutionOptions) -> Path | None:
     return found if named or found.is_file() else None
 
 
-def _needs(plan: StudyPlan, options: ExecutionOptions) -> Needs:
-    """What a run that is no reference takes of a machine."""
-    gpus = options.gpus if options.gpus is not None else int(plan.spec.device.startswith("cuda"))
-    return Needs(options.cores, 0 if plan.spec.device == "cpu" else gpus, options.memory_bytes)
+def _most_needed(plan: StudyPlan, options: ExecutionOptions) -> Needs:
+    """What the most demanding run takes of a machine."""
+    gpus = max((_needs(run, False, options).gpus for run in plan.runs), default=0)
+    return Needs(options.cores, gpus, options.memory_bytes)
+
+
+def _needs(run: PlannedRun, is_reference: bool, options: ExecutionOptions) -> Needs:
+    """What `run` takes of a machine."""
+    asked = 1 if options.gpus is None else options.gpus
+    gpus = 0 if is_reference or run.device == CPU else asked
+    return Needs(options.cores, gpus, options.memory_bytes)
 
 
 @contextmanager
 def _workers(plan: StudyPlan, store: Store, options: ExecutionOptions, total: int) -> Iterator[Workers | None]:
     """Where runs are made: None for this process itself, which shows how far each run is."""
-    needs = _needs(plan, options)
+    needs = _most_needed(plan, options)
     alone = options.on is None and (options.jobs or 1) == 1 and needs == replace(needs, cores=None, memory_bytes=None)
     if alone or total == 0:
         yield None
@@ -189,7 +215,7 @@ def _job(
         overrides=dict(run.overrides),
         reference=run.reference,
         is_reference=is_reference,
-        device="cpu" if is_reference else plan.spec.device,
+        device=CPU if is_reference else run.device,
         timeout_seconds=plan.spec.timeout_seconds,
         timing_frames=run.timing_frames,
         lpips_weights=str(options.lpips_weights.resolve()) if options.lpips_weights else None,
@@ -215,34 +241,61 @@ def _seconds_before(plan: StudyPlan, store: Store) -> list[float]:
 
 
 class _Progress:
-    """Tells the user before each run which one it is and about how long the rest takes."""
+    """Tells the user before each run which one it is and about how long the rest takes, and of long ones how far they
+    are."""
 
     def __init__(self, total: int, options: ExecutionOptions, seconds: list[float], at_once: int) -> None:
         # How many there will be is not known where the order may leave some out.
         self._total = total if options.order is None else None
         self._at_once, self._tell = at_once, options.tell
         self._seconds, self._started, self.ended = seconds, 0, 0
+        self._told = time.monotonic()
+
+    def _say(self, line: str) -> None:
+        self._told = time.monotonic()
+        self._tell(line)
 
     def starts(self, job: Job) -> None:
         self._started += 1
         if self._total is None:
-            self._tell(f"run {self._started}: {job.title}")
+            self._say(f"run {self._started}: {job.title}")
             return
         remaining = ""
         if self._seconds:
             mean = sum(self._seconds) / len(self._seconds)
             remaining = f", about {duration(mean * (self._total - self.ended) / self._at_once)} left"
-        self._tell(f"run {self._started} of {self._total}{remaining}: {job.title}")
+        self._say(f"run {self._started} of {self._total}{remaining}: {job.title}")
+
+    def goes_on(self, tasks: Sequence[_Task]) -> None:
+        """Tell of runs that are being made, once nothing has been told for a while: the longest ones, by their logs."""
+        now = time.monotonic()
+        if not tasks or now - self._told < _SILENT_SECONDS:
+            return
+        longest = sorted(tasks, key=lambda task: task.started)[:_SHOWN_RUNS]
+        shown = [f"{task.job.title} for {duration(now - task.started)}{_how_far(task.job)}" for task in longest]
+        more = f", and {len(tasks) - len(shown)} more" if len(tasks) > len(shown) else ""
+        self._say(f"{self.ended} ended; being made: {'; '.join(shown)}{more}")
 
     def is_lost(self, job: Job, reason: str) -> None:
         """Tell of a run that starts once more."""
-        self._tell(f"lost: {job.title}: {reason}; it is made again")
+        self._say(f"lost: {job.title}: {reason}; it is made again")
 
     def ends(self, entry: RunEntry) -> None:
         self.ended += 1
         self._seconds.append(entry.seconds)
         if entry.status != "ok":
-            self._tell(f"failed: {entry.title}: {entry.status}: {entry.reason}")
+            self._say(f"failed: {entry.title}: {entry.status}: {entry.reason}")
+
+
+def _how_far(job: Job) -> str:
+    """The last line of a run's log, where there is any."""
+    try:
+        with Attempt(Path(job.attempt)).log.open("rb") as log:
+            log.seek(max(0, os.fstat(log.fileno()).st_size - _LOG_TAIL_BYTES))
+            lines = log.read().decode("utf-8", errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    return f" ({one_line(lines[-1])[:100]})" if lines else ""
 
 
 def _run_here(jobs: Iterable[Job], store: Store, progress: _Progress) -> None:
@@ -258,36 +311,62 @@ def _run_here(jobs: Iterable[Job], store: Store, progress: _Progress) -> None:
         progress.ends(commit(store, attempt))
 
 
-def _run_all(jobs: Iterable[Job], needs: Needs, workers: Workers, store: Store, progress: _Progress) -> None:
-    waiting = iter(jobs)
-    again: list[tuple[Job, int]] = []
-    running: dict[str, tuple[Job, int]] = {}
+@dataclass
+class _Task:
+    """A run that waits or is being made, for the `tries`th time, since `started` of the monotonic clock."""
+
+    job: Job
+    needs: Needs
+    tries: int = 1
+    started: float = 0.0
+
+
+def _run_all(
+    jobs: Iterable[tuple[Job, Needs]], workers: Workers, least: Needs, store: Store, progress: _Progress
+) -> None:
+    """Make `jobs`, several at once; those that need less may go before. least: what every one of them needs."""
+    following = iter(jobs)
+    waiting: list[_Task] = []
+    running: dict[str, _Task] = {}
     more = True
-    while more or again or running:
-        while (more or again) and workers.room(needs) > 0:
-            if again:
-                job, tries = again.pop()
+    while more or waiting or running:
+        for task in [*waiting]:
+            if workers.room(task.needs) > 0:
+                waiting.remove(task)
+                running[_start(task, workers, progress)] = task
+        while more and len(waiting) < _AHEAD and workers.room(least) > 0:
+            found = next(following, None)
+            if found is None:
+                more = False
+                break
+            task = _Task(*found)
+            if workers.room(task.needs) > 0:
+                running[_start(task, workers, progress)] = task
             else:
-                following = next(waiting, None)
-                if following is None:
-                    more = False
-                    continue
-                job, tries = following, 1
-                progress.starts(job)
-            attempt = Attempt(Path(job.attempt))
-            write_model(attempt.request, job)
-            task = f"{carry_out_file.__module__}:{carry_out_file.__qualname__}"
-            workers.start(Work(attempt.folder.name, task, attempt.request, attempt.log, needs))
-            running[attempt.folder.name] = job, tries
-        for ended in workers.wait():
-            job, tries = running.pop(ended.key)
-            if ended.lost and not Path(job.attempt, "entry.json").is_file() and tries < _TRIES:
+                waiting.append(task)
+        for ended in workers.wait() if more or running or waiting else []:
+            task = running.pop(ended.key)
+            job = task.job
+            if ended.lost and not Path(job.attempt, "entry.json").is_file() and task.tries < _TRIES:
                 progress.is_lost(job, ended.lost)
                 # In a folder of its own: nobody knows whether the lost one goes on.
                 job = job.model_copy(update={"attempt": str(new_attempt(store, job.digest).resolve())})
-                again.append((job, tries + 1))
+                waiting.insert(0, _Task(job, task.needs, task.tries + 1))
             else:
                 progress.ends(_entry(job, ended, store))
+        progress.goes_on(list(running.values()))
+
+
+def _start(task: _Task, workers: Workers, progress: _Progress) -> str:
+    """Start the run; returns the key of its work."""
+    if task.tries == 1:
+        progress.starts(task.job)
+    task.started = time.monotonic()
+    attempt = Attempt(Path(task.job.attempt))
+    write_model(attempt.request, task.job)
+    carried_out = f"{carry_out_file.__module__}:{carry_out_file.__qualname__}"
+    workers.start(Work(attempt.folder.name, carried_out, attempt.request, attempt.log, task.needs))
+    return attempt.folder.name
 
 
 def _is_there(path: Path, seconds: float) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Method
-from splashbench.harness.devices import chosen_device
+from splashbench.harness.devices import planned_device
 from splashbench.harness.discovery import load_method
 from splashbench.harness.runner import TIMING_FRAMES, without_nulls
 from splashbench.scene import Scene
@@ -43,6 +43,7 @@ class PlannedRun:
         reference: digest of the reference run its dpsnr_bg is measured against, None where there is none.
         timing_frames: renders timed for the frame rate; none where the study does not ask for it.
         control: whether the method is a control.
+        device: what the method runs on.
     """
 
     scene: NamedScene
@@ -55,6 +56,7 @@ class PlannedRun:
     reference: str | None
     timing_frames: int
     control: bool
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,15 @@ class StudyPlan:
         return tuple(run for run in self.references if not run.variant.perturbation and run.variant.train_views is None)
 
 
-def make_plan(spec: StudySpec) -> StudyPlan:
+def make_plan(spec: StudySpec, gpu_elsewhere: bool | None = None) -> StudyPlan:
     """The runs of `spec`, seed by seed. All that can be wrong before a run starts is reported here.
+
+    gpu_elsewhere: whether one of the other machines that make the runs has a GPU (`cluster.place.has_gpu`); None where
+    this one makes them.
 
     Raises SplashbenchError, one line, for a missing scene, an unknown method, preset or setting.
     """
-    rows = {variant.name: _row(spec, variant) for variant in spec.variants}
+    rows = {variant.name: _row(spec, variant, gpu_elsewhere) for variant in spec.variants}
     scenes = _open_scenes(spec)
     timing = TIMING_FRAMES if "render_fps" in spec.metrics else 0
     references: dict[str, PlannedRun] = {}
@@ -96,13 +101,14 @@ def make_plan(spec: StudySpec) -> StudyPlan:
                         scene,
                         variant,
                         seed,
-                        _digest(row.method, row.preset, row.resolved, seed, spec.device, scene.scene, variant),
+                        _digest(row.method, row.preset, row.resolved, seed, row.device, scene.scene, variant),
                         row.name,
                         row.preset,
                         row.overrides,
                         reference.digest if reference else None,
                         timing,
                         row.method.control,
+                        row.device,
                     )
                 )
     method = load_method(spec.method)
@@ -111,23 +117,24 @@ def make_plan(spec: StudySpec) -> StudyPlan:
 
 
 class _MethodChoice(NamedTuple):
-    """What a variant runs: its method, the method's name in the spec, preset, overrides and resolved settings."""
+    """What a variant runs: its method, the method's name in the spec, preset, overrides, resolved settings, device."""
 
     method: Method
     name: str
     preset: str
     overrides: dict[str, Any]
     resolved: dict[str, Any]
+    device: str
 
 
-def _row(spec: StudySpec, variant: StudyVariant) -> _MethodChoice:
+def _row(spec: StudySpec, variant: StudyVariant, gpu_elsewhere: bool | None) -> _MethodChoice:
     name = variant.method or spec.method
     method = load_method(name)
-    chosen_device(method, spec.device)
+    device = planned_device(method, spec.device, gpu_elsewhere)
     of_study_method = variant.method is None
     preset = variant.preset or (spec.preset if of_study_method else None) or next(iter(method.Config.presets))
     overrides, resolved = _checked(spec, method, variant.name, preset, variant.settings, with_base=of_study_method)
-    return _MethodChoice(method, name, preset, overrides, resolved)
+    return _MethodChoice(method, name, preset, overrides, resolved, device)
 
 
 def _open_scenes(spec: StudySpec) -> tuple[NamedScene, ...]:

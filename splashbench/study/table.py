@@ -41,6 +41,9 @@ _PAPER_COLUMNS = {
 }
 
 
+#: What a run costs on its machine. A mean over GPUs and processors would be of neither.
+_OF_THE_MACHINE = ("fit_seconds", "render_fps", "peak_memory_bytes", "peak_device_memory_bytes")
+
 _REFERENCE_NOTE = "control: the background alone"
 _FADED_NOTE = "control: the row's own renders of the timesteps before and after, averaged"
 
@@ -124,6 +127,11 @@ class TableRow:
         return any(run.result is not None and run.result.mixed for run in self.runs)
 
     @property
+    def on_gpu_and_processor(self) -> bool:
+        """Whether some of its runs were made on a GPU and others were not: its costs have no mean then."""
+        return _on_gpu_and_processor(self.runs)
+
+    @property
     def complete(self) -> bool:
         """Whether every run of the row succeeded."""
         return self.count("ok") == len(self.runs)
@@ -182,11 +190,14 @@ def make_table(plan: StudyPlan, store: Store) -> Table:
         name = plan.reference_row[0].variant.name
         notes[name], runs[name] = _REFERENCE_NOTE, tuple(_study_run(run, store) for run in plan.reference_row)
     run_frame = _run_frame([run for row in runs.values() for run in row], spec.metrics)
+    apart = run_frame["variant"].isin([name for name, row in runs.items() if _on_gpu_and_processor(row)])
+    compared = run_frame.copy()
+    compared.loc[apart, [metric for metric in spec.metrics if metric in _OF_THE_MACHINE]] = float("nan")
     scenes_of = {
         metric: tuple(s.name for s in plan.scenes if s.name in set(run_frame["scene"][run_frame[metric].notna()]))
         for metric in spec.metrics
     }
-    means = _scene_means(run_frame, scenes_of)
+    means = _scene_means(compared, scenes_of)
     figures = _figures(means, spec.baseline)
     paper = _paper_figures(spec)
     rows = [
@@ -201,6 +212,10 @@ def make_table(plan: StudyPlan, store: Store) -> Table:
         for name, note in notes.items()
     ]
     return Table(plan, tuple(rows), run_frame, figures, scenes_of)
+
+
+def _on_gpu_and_processor(runs: Sequence[StudyRun]) -> bool:
+    return len({bool(run.result.hardware.get("gpu")) for run in runs if run.result is not None}) > 1
 
 
 def _study_run(planned: PlannedRun, store: Store, faded: bool = False) -> StudyRun:

@@ -178,6 +178,9 @@ def _missing(table: Table) -> list[str]:
                 metric = run.result.metrics.get(source)
                 if metric is not None and metric.value is None:
                     reasons[f"{metric_of(name).title}: {escaped(metric.reason or '')}"].append(run.planned.variant.name)
+    apart = [row.name for row in table.rows if row.on_gpu_and_processor]
+    if apart:
+        reasons["Costs: some runs were made on a GPU and others not; make all of them on one kind"] += apart
     lines = [f"{reason} ({', '.join(dict.fromkeys(rows))})" for reason, rows in sorted(reasons.items())]
     return ["## Why a figure is missing", bullets(lines)] if lines else []
 

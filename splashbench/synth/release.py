@@ -2,6 +2,9 @@
 
 The real one has tens of gigabytes. This one takes the same road, from the download to the leaderboard, in minutes. It
 holds what the release holds and lacks what the release lacks: no scene.json, hence no times, gravity or scale.
+
+Scans and container masks are those of one bowl that stands on the floor, so where it belongs is known: `bowl_pose`. The
+photographs do not show it.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from splashbench.files import atomic_path
 from splashbench.manifest import load_scenes
@@ -24,6 +28,13 @@ from splashbench.synth.balls import ball_cameras, ball_centers, floor_points, re
 _TRAIN, _TEST = ("1", "2", "3", "4", "5"), ("6", "7")
 #: Of a zip entry: any fixed instant, so that the same imitation has the same bytes.
 _WHEN = (2020, 1, 1, 0, 0, 0)
+#: Metres in a unit of the imitation's scenes. A scan is in metres.
+METRES_PER_UNIT = 0.25
+# The bowl: radius and height along its wall, metres, outside and back inside. The outside is convex.
+_BOWL = ((0.0, 0.0), (0.05, 0.0), (0.075, 0.05), (0.07, 0.05), (0.046, 0.005), (0.0, 0.005))
+_BOWL_SECTIONS = 24
+# Where it stands on the floor, scene units.
+_BOWL_PLACE = (0.02, 0.0, 0.05)
 
 
 @dataclass(frozen=True)
@@ -63,7 +74,7 @@ def write_release(path: Path, scenes: Sequence[Imitation]) -> None:
                     )
                     file.unlink()
             if scene.scanned:
-                _add(archive, f"data/meshes/{scene.name}.glb", _bowl())
+                _add(archive, f"data/meshes/{scene.name}.glb", bytes(_bowl().export(file_type="glb")))
 
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
@@ -102,12 +113,25 @@ def _cropped(camera: Camera, left: int, top: int) -> Camera:
 
 
 def _container_mask(camera: Camera) -> NDArray[np.bool_]:
-    mask = np.zeros((camera.height, camera.width), dtype=bool)
-    mask[camera.height // 2 : -camera.height // 8, camera.width // 3 : -camera.width // 3] = True
+    """Where `camera` sees the bowl, [H, W]: its outside is convex, so that is the hull of its projected vertices."""
+    pose = bowl_pose()
+    pixels, _ = camera.project(_bowl().vertices @ pose[:3, :3].T + pose[:3, 3])
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    mask = np.ones((camera.height, camera.width), dtype=bool)
+    for a, b, c in ConvexHull(pixels).equations:  # a u + b v + c is negative inside
+        mask &= a * u + b * v + c <= 0
     return mask
 
 
-def _bowl() -> bytes:
-    """A bowl of 15 centimetres as binary glTF; lengths in metres."""
-    outline = np.array([[0.0, 0.0], [0.05, 0.0], [0.075, 0.05], [0.07, 0.05], [0.046, 0.005], [0.0, 0.005]])
-    return bytes(trimesh.creation.revolve(outline, sections=24).export(file_type="glb"))
+def bowl_pose() -> NDArray[np.float64]:
+    """Where the scanned bowl belongs in every scene: [4, 4], metres to scene units."""
+    pose = np.eye(4)
+    pose[:3, :3] /= METRES_PER_UNIT
+    pose[:3, 3] = _BOWL_PLACE
+    return pose
+
+
+def _bowl() -> trimesh.Trimesh:
+    """A bowl of 15 centimetres; lengths in metres, y up as in every binary glTF."""
+    body = trimesh.creation.revolve(np.array(_BOWL), sections=_BOWL_SECTIONS)
+    return trimesh.Trimesh(body.vertices[:, [0, 2, 1]] * (1, 1, -1), body.faces, process=False)

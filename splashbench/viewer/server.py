@@ -23,7 +23,7 @@ DEFAULT_PORT = 8080
 _TRIED = 50
 # Ports that other programs may take between the look and the use.
 _RACES = 10
-INSTALL = "pip install 'splashbench[view]'"
+INSTALL = "in a checkout: pip install -c constraints.txt -e '.[view]'"
 
 
 def is_loopback(host: str) -> bool:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from splashbench.benchmark.budgets import make_benchmark_plan, make_entrants
@@ -18,6 +20,7 @@ from splashbench.benchmark.estimate import Machine, estimate, load_rates
 from splashbench.benchmark.scenes import find_scenes
 from splashbench.cli.main import main
 from splashbench.files import list_files
+from splashbench.study import execution
 from splashbench.study.job import Store
 
 GREY = f"{Path(__file__).parents[1] / 'study' / 'study_methods.py'}:Grey"
@@ -68,6 +71,52 @@ def test_a_dry_run_makes_nothing(real: Path, tmp_path: Path, capsys: pytest.Capt
     assert "whole fits recorded at 240x160" in said
     assert "(longest_side=16384): scaffold_4d, spacetime_gaussians, deformable_3dgs" in said
     assert "its own handicap" in said
+
+
+def test_an_estimate_that_the_machine_lacks_room_for_is_said(
+    real: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["benchmark", "run", str(tmp_path / "out"), "--scenes", str(real), "--dry-run"]
+    assert main(words) == 0
+    alone = capsys.readouterr().err
+    assert "That is more" not in alone
+    memory = psutil.virtual_memory()
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory._replace(total=3_000_000_000))
+    assert main([*words, "--jobs", "20"]) == 0
+    assert "That is more memory than the 3.0 GB of this machine: give fewer --jobs" in capsys.readouterr().err
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: usage._replace(free=1000))
+    assert main(words) == 0
+    assert (
+        f"That is more than the 0.0 GB that are free at {tmp_path}: give OUT on a larger disk"
+        in capsys.readouterr().err
+    )
+
+
+def test_on_many_machines_the_estimate_is_of_one_run_at_a_time(
+    real: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execution, "has_gpu", lambda on: True)
+    assert main(["benchmark", "run", str(tmp_path / "out"), "--scenes", str(real), "--dry-run", "--on", "ray"]) == 0
+    assert (
+        "That is one run at a time, with the threads of --cores (1), on a machine like this" in capsys.readouterr().err
+    )
+
+
+def test_what_it_does_on_ray_it_does_here(made: Path, real: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="comes with the extra [cluster]")
+    scene = str(find_scenes([str(real)])[0])
+    words = ["benchmark", "run", str(tmp_path / "out"), "--scenes", scene, "--methods", "nearest_camera", "--on", "ray"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "splashbench", *words], capture_output=True, text=True, check=False, timeout=600
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "Ray: " in ended.stderr
+    found, here = without_times(tmp_path / "out"), without_times(made)
+    assert {key[:2] for key in found} == {("nearest_camera", "bowl_001"), ("nothing", "bowl_001")}
+    there, here_too = (each["nearest_camera", "bowl_001", 0]["metrics"] for each in (found, here))
+    of_the_reference = ("dpsnr_bg", "spill_rgb")  # which has few steps in the fixture
+    assert {name for name in there if there[name] != here_too[name]} <= set(of_the_reference)
 
 
 def test_a_method_that_nobody_recorded_is_said(real: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,12 +14,11 @@ from typing import Any
 import pytest
 
 from splashbench.benchmark import repository
-from splashbench.benchmark.repository import WORKFLOW, init_benchmark, read_benchmark, read_entries
+from splashbench.benchmark.repository import WORKFLOW, init_benchmark, read_benchmark, read_entries, workflow_fault
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import list_files, sha256_file
 from splashbench.scene import Scene
-from splashbench.version import __version__
 
 FACTS = 'title = "Grey"\nauthors = "A. Author"\ncode = "https://example.org/grey"\n'
 
@@ -75,14 +74,60 @@ def test_the_same_entries_give_the_same_bytes(benchmark: Path, tmp_path: Path) -
     assert trees[0] == trees[1]
 
 
-def test_the_workflow_step_by_step(benchmark: Path, tmp_path: Path) -> None:
-    """Every command of the workflow, in a fresh clone, as the runner would; what is installed is this very version."""
-    yaml = pytest.importorskip("yaml")
-    git = ["git", "-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "init.defaultBranch=main"]
+#: For a pip that is not to reach any index, with what is installed here to build by.
+OFFLINE = {
+    "PIP_NO_INDEX": "1",
+    "PIP_NO_DEPS": "1",
+    "PIP_NO_BUILD_ISOLATION": "false",
+    "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+}
+GIT = ["git", "-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "init.defaultBranch=main"]
+
+
+def commit(folder: Path) -> None:
     for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "A first entry"]):
-        subprocess.run([*git, *words], cwd=benchmark, check=True)
+        subprocess.run([*GIT, *words], cwd=folder, check=True)
+
+
+def stand_in(folder: Path) -> Path:
+    """The source of a package that is called splashbench and does nothing."""
+    (folder / "splashbench").mkdir(parents=True)
+    (folder / "splashbench" / "__init__.py").write_text("STAND_IN = True\n")
+    (folder / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
+        '[project]\nname = "splashbench"\nversion = "9.9"\n[tool.setuptools]\npackages = ["splashbench"]\n'
+    )
+    return folder
+
+
+def as_a_shell(command: str, place: Path, **environment: str) -> None:
+    """Run a command as a workflow's step; what is installed here comes first."""
+    binaries = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    subprocess.run(
+        ["bash", "-eo", "pipefail", "-c", command],
+        cwd=place,
+        check=True,
+        env={**os.environ, "PATH": binaries, **environment},
+    )
+
+
+def install_command(folder: Path) -> str:
+    yaml = pytest.importorskip("yaml")
+    steps = yaml.safe_load((folder / WORKFLOW).read_text())["jobs"]["site"]["steps"]
+    (command,) = [step["run"] for step in steps if step.get("name") == "Install"]
+    return command
+
+
+def test_the_workflow_step_by_step(benchmark: Path, tmp_path: Path) -> None:
+    """Every command of the workflow, in a fresh clone, as the runner would; the wheel is a stand-in's."""
+    yaml = pytest.importorskip("yaml")
+    pytest.importorskip("setuptools")
+    source = stand_in(tmp_path / "source")
+    (how,) = re.findall(r"`(python -m pip wheel .*?)`", (benchmark / "README.md").read_text())
+    as_a_shell(how.replace("SPLASHBENCH", str(source)), benchmark, **OFFLINE)
+    commit(benchmark)
     clone = tmp_path / "clone"
-    subprocess.run([*git, "clone", "-q", str(benchmark), str(clone)], check=True)
+    subprocess.run([*GIT, "clone", "-q", str(benchmark), str(clone)], check=True)
     workflow = yaml.safe_load((clone / WORKFLOW).read_text())
     assert set(workflow[True]) == {"pull_request", "push", "workflow_dispatch"}  # "on" is a truth value in YAML 1.1
     assert workflow["jobs"]["publish"]["needs"] == "site"
@@ -93,13 +138,103 @@ def test_the_workflow_step_by_step(benchmark: Path, tmp_path: Path) -> None:
         "actions/upload-pages-artifact",
     ]
     commands = [step["run"] for step in steps if "run" in step]
-    assert commands[0] == f'python -m pip install "splashbench=={__version__}"'
-    binaries = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    assert commands[0] == install_command(clone)
+    assert commands[0] in (clone / "README.md").read_text()
+    target = tmp_path / "target"
+    as_a_shell(commands[0], clone, **OFFLINE, PIP_TARGET=str(target))
+    assert (target / "splashbench" / "__init__.py").read_text() == "STAND_IN = True\n"
     for command in commands[1:]:
-        subprocess.run(["sh", "-ec", command], cwd=clone, check=True, env={**os.environ, "PATH": binaries})
+        as_a_shell(command, clone)
     (upload,) = [step for step in steps if "upload-pages-artifact" in step.get("uses", "")]
     assert (clone / upload["with"]["path"] / "index.html").is_file()
     assert subprocess.run(["git", "status", "--porcelain"], cwd=clone, capture_output=True, check=True).stdout == b""
+
+
+def test_a_tag_of_a_repository_is_what_the_workflow_installs(tmp_path: Path) -> None:
+    pytest.importorskip("setuptools")
+    source, target, folder = stand_in(tmp_path / "source"), tmp_path / "target", tmp_path / "benchmark"
+    commit(source)
+    subprocess.run([*GIT, "tag", "v9.9"], cwd=source, check=True)
+    (source / "splashbench" / "__init__.py").write_text("LATER = True\n")
+    subprocess.run([*GIT, "commit", "-q", "-a", "-m", "Later"], cwd=source, check=True)
+    address = "https://example.org/group/splashbench.git"
+    assert main(["benchmark", "init", str(folder), "--install", f"git+{address}@v9.9"]) == 0
+    command = install_command(folder)
+    assert command in (folder / "README.md").read_text()
+    assert not (folder / "wheels").exists()
+    # git takes the repository beside for that address.
+    config = {
+        "GIT_CONFIG_COUNT": "1",
+        "GIT_CONFIG_KEY_0": f"url.{source.as_uri()}.insteadOf",
+        "GIT_CONFIG_VALUE_0": address,
+    }
+    as_a_shell(command, folder, **OFFLINE, **config, PIP_TARGET=str(target))
+    assert (target / "splashbench" / "__init__.py").read_text() == "STAND_IN = True\n"
+
+
+def test_a_missing_wheel_is_told(benchmark: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "check", str(benchmark), "--json"]) == 0
+    told = capsys.readouterr()
+    warning = [line for line in told.err.splitlines() if line.startswith("warning: ")]
+    assert len(warning) == 1
+    assert "installs ./wheels/splashbench-*.whl, of which there is none; keep one wheel there" in warning[0]
+    assert json.loads(told.out)["workflow"] in warning[0]
+    (benchmark / "wheels" / "splashbench-9.8-py3-none-any.whl").touch()
+    assert workflow_fault(benchmark) == ""
+    (benchmark / "wheels" / "splashbench-9.9-py3-none-any.whl").touch()
+    assert "there are 2" in workflow_fault(benchmark)
+
+
+def test_a_wheel_of_another_name_is_installed_by_its_path(tmp_path: Path) -> None:
+    folder = tmp_path / "benchmark"
+    assert main(["benchmark", "init", str(folder), "--install", "tools/splashbench-9.9-py3-none-any.whl"]) == 0
+    assert install_command(folder) == "python -m pip install ./tools/splashbench-9.9-py3-none-any.whl"
+    assert "there is none" in workflow_fault(folder)
+    (folder / "tools").mkdir()
+    (folder / "tools" / "splashbench-9.9-py3-none-any.whl").touch()
+    assert workflow_fault(folder) == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "splashbench",  # of an index, where anybody may take the name
+        "splashbench==1.0",
+        "splashbench @ git+https://example.org/a/b@v1",
+        "git+https://example.org/a/b",  # whatever is there by then
+        "git+http://example.org/a/b@v1",
+        "git+https://user:secret@example.org/a/b@v1",
+        "git+https://example.org/a/b@v1; curl example.org",
+        "git+https://example.org/a/b@v1\n        run: id",
+        "git+https://example.org/a/b@v1\n",
+        "git+https://example.org/a/b@$(id)",
+        "git+https://example.org/a/b@${{ secrets.TOKEN }}",
+        "git+https://example.org/a/b@`id`",
+        "git+https://example.org/a/b@--upload-pack=id",
+        'git+https://example.org/a/b@v1" "x',
+        "git+https://example.org/a/b@v1 'x'",
+        "-r wheels/a.whl",
+        "-rwheels/a.whl",
+        "--index-url=https://example.org/a.whl",
+        "../a.whl",
+        "/tmp/a.whl",
+        "wheels/../../a.whl",
+        "wheels/a b.whl",
+        "wheels/*.whl",
+        "https://example.org/a.whl",
+        "wheels/a.tar.gz",
+        "wheels/" + "a" * 300 + ".whl",
+        "",
+    ],
+)
+def test_what_must_not_stand_in_a_workflow_is_refused(
+    words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["benchmark", "init", str(tmp_path / "new"), f"--install={words}"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: --install ")
+    assert "cannot stand in a workflow; give git+https://HOST/PATH@TAG" in line
+    assert not (tmp_path / "new").exists()
 
 
 def _no_result(entry: Path, made: Path) -> None:
@@ -254,3 +389,18 @@ def test_a_benchmark_that_could_not_be_read_again_is_not_made(tmp_path: Path) ->
     with pytest.raises(SplashbenchError, match="title"):
         init_benchmark(tmp_path / "new", "x" * 101)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("words", ['"splashbench==0.2.0"', "splashbench", "'splashbench[test]'"])
+def test_a_workflow_that_asks_an_index_is_told(words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As `init` once wrote it."""
+    folder = tmp_path / "mine"
+    init_benchmark(folder, "Mine", install="git+https://example.org/a/splashbench@v1")
+    assert main(["benchmark", "check", str(folder)]) == 0
+    assert "warning" not in capsys.readouterr().err
+    path = folder / WORKFLOW
+    path.write_text(path.read_text().replace("git+https://example.org/a/splashbench@v1", words))
+    assert main(["benchmark", "check", str(folder)]) == 0
+    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert len(warnings) == 1
+    assert "asks a package index for splashbench, which none has" in warnings[0]

@@ -8,8 +8,14 @@ from typing import Any
 import pytest
 
 from splashbench.benchmark import estimate as module
-from splashbench.benchmark.budgets import DEFAULT_METHODS, NATIVE_SIDE, make_benchmark_plan, make_entrants
-from splashbench.benchmark.estimate import Machine, estimate, load_rates, measure_machine
+from splashbench.benchmark.budgets import (
+    DEFAULT_METHODS,
+    NATIVE_SIDE,
+    _paper_of,
+    make_benchmark_plan,
+    make_entrants,
+)
+from splashbench.benchmark.estimate import Estimate, Machine, MethodEstimate, estimate, load_rates, measure_machine
 from splashbench.benchmark.scenes import find_scenes
 from splashbench.download.scenes import _remember
 from splashbench.errors import SplashbenchError
@@ -58,6 +64,39 @@ def test_the_estimate_grows_with_pixels_and_machine(real: Path, tmp_path: Path) 
     assert module._line(recorded.points, 0.24) == dict(recorded.points)[0.24]
     (x0, y0), (x1, y1) = recorded.points[-2:]
     assert module._line(recorded.points, 2 * x1) == pytest.approx(y1 + (y1 - y0) / (x1 - x0) * x1)
+
+
+@pytest.mark.parametrize(
+    ("cores", "jobs", "each", "share"),
+    [
+        (2, 1, None, 1.0),
+        (2, 2, None, 1.0),  # two cores are shared: nothing is gained
+        (2, 8, None, 1.0),
+        (16, 8, None, 9 / 16),  # a run with all 16 goes 9 times as fast as with one, 8 with two each 2 times
+        (16, 1, 1, 9.0),
+        (16, 4, 1, 9 / 4),
+        (16, 99, 1, 9 / 16),
+    ],
+)
+def test_runs_at_once_gain_what_further_cores_are_worth(cores: int, jobs: int, each: int | None, share: float) -> None:
+    found = Estimate([MethodEstimate("one", "best", 1, seconds=100.0)], 1, 0.0, Machine(cores, 1.0))
+    assert found.seconds_at_once(jobs, each) == pytest.approx(100 * share)
+
+
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        (["bowl_001", "tank_003"], "real_20"),
+        (["WaterSphere"], "watersphere"),
+        (["WaterSphere", "WaterCube"], None),  # the paper has no mean of these
+        (["HoneyCone"], None),
+        (["bowl_001", "mine"], None),
+        (["real_20"], None),  # the name of a set is no scene's
+    ],
+)
+def test_the_papers_figures_stand_beside_its_own_scenes_alone(names: list[str], shown: str | None) -> None:
+    found = _paper_of(names)
+    assert (found.scene_set if found else None) == shown
 
 
 def test_the_machine_is_measured_in_processor_time() -> None:

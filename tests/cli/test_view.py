@@ -181,4 +181,4 @@ def test_without_a_browser_a_screenshot_is_one_line(
 
 def test_without_viser_the_extra_is_named(balls_directory: Path, fails: Fails, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install 'splashbench[view]'" in fails("view", balls_directory)
+    assert "pip install -c constraints.txt -e '.[view]'" in fails("view", balls_directory)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from splashbench.cluster.environment import passed_on, thread_limits
 from splashbench.cluster.local import LocalWorkers
 from splashbench.cluster.place import ray_address, workers_at
 from splashbench.cluster.shared_folder import fault_here, require_answer, shared
-from splashbench.cluster.work import Needs
+from splashbench.cluster.work import Needs, Work
 from splashbench.errors import SplashbenchError
 
 
@@ -47,7 +49,9 @@ def test_without_ray_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch, t
         return original(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(SplashbenchError, match=r"Ray is not installed; pip install 'splashbench\[cluster\]'"):
+    with pytest.raises(
+        SplashbenchError, match=r"Ray is not installed; .*pip install -c constraints.txt -e '\.\[cluster\]'"
+    ):
         workers_at("ray", None, [], folder=tmp_path, inputs=[], needs=Needs())
 
 
@@ -98,3 +102,59 @@ def test_variables_of_this_toolkit_go_along_and_marks_do_not(monkeypatch: pytest
     monkeypatch.setenv("SPLASHBENCH_RUN", "a mark")
     assert passed_on()["SPLASHBENCH_CACHE"] == "somewhere"
     assert "SPLASHBENCH_RUN" not in passed_on()
+
+
+def machine(cores: int, gpus: int = 0, memory: float = 64e9) -> dict[str, Any]:
+    return {"Alive": True, "Resources": {"CPU": float(cores), "GPU": float(gpus), "memory": memory}}
+
+
+def ray_workers(machines: list[dict[str, Any]], at_once: int | None, tmp_path: Path, running: Sequence[Needs]) -> Any:
+    """Workers of a made-up cluster in which work of these needs runs."""
+    pytest.importorskip("ray", reason="comes with the extra [cluster]")
+    from splashbench.cluster.on_ray import RayWorkers
+
+    workers = RayWorkers(None, at_once, [], tmp_path, [], Needs(), lambda line: None)
+    workers._machines = machines
+    workers._looked = time.monotonic() + 1000
+    work = [Work(str(number), "module:task", tmp_path, tmp_path, needs) for number, needs in enumerate(running)]
+    workers._running = {each.key: each for each in work}
+    return workers
+
+
+ONE, GPU = Needs(cores=1), Needs(cores=1, gpus=1)
+
+
+@pytest.mark.parametrize(
+    ("machines", "at_once", "running", "expected"),
+    [
+        # With and without a GPU: how much more may start.
+        ([machine(4, 1)], None, [], (4, 1)),
+        ([machine(4, 1)], None, [GPU], (3, 0)),
+        ([machine(4, 1)], None, [ONE], (3, 1)),
+        ([machine(4, 1)], None, [ONE] * 4, (0, 0)),
+        ([machine(4, 1)], 2, [ONE], (1, 1)),
+        ([machine(4, 1)], 2, [ONE, GPU], (0, 0)),
+        ([machine(64), machine(2, 2)], None, [ONE] * 30, (36, 2)),
+        ([machine(64), machine(2, 2)], None, [GPU], (65, 1)),
+        ([machine(64)], None, [], (64, 0)),
+        ([], None, [], (0, 0)),
+    ],
+)
+def test_room_on_a_cluster(
+    machines: list[dict[str, Any]], at_once: int | None, running: list[Needs], expected: tuple[int, int], tmp_path: Path
+) -> None:
+    workers = ray_workers(machines, at_once, tmp_path, running)
+    assert (max(0, workers.room(ONE)), max(0, workers.room(GPU))) == expected
+
+
+def test_a_gpu_on_a_machine_with_too_few_cores_is_no_room(tmp_path: Path) -> None:
+    workers = ray_workers([machine(64), machine(16, 1)], None, tmp_path, [])
+    assert workers.room(Needs(cores=32)) == 2
+    assert workers.room(Needs(cores=32, gpus=1)) == 0
+
+
+def test_who_shares_a_machine_with_a_run_on_its_gpu(tmp_path: Path) -> None:
+    workers = ray_workers([machine(8, 1)], None, tmp_path, [])
+    assert (workers.sharing(ONE), workers.sharing(GPU)) == (8, 8)
+    assert ray_workers([machine(8, 1)], 3, tmp_path, []).sharing(GPU) == 3
+    assert ray_workers([], None, tmp_path, []).sharing(GPU) == 1

@@ -108,7 +108,7 @@ def test_what_runs_when_workers_are_left_is_stopped(monkeypatch: pytest.MonkeyPa
     with LocalWorkers(1, ["tasks"]) as workers:
         workers.start(_work("hang", tmp_path))
         _wait_for(lambda: (tmp_path / "hang.done").exists())
-        assert _running(str(tmp_path / "hang")) != []
+        _wait_for(lambda: _running(str(tmp_path / "hang")) != [])
     assert _running(str(tmp_path / "hang")) == []
 
 

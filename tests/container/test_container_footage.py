@@ -10,63 +10,23 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import trimesh
-from scipy.ndimage import map_coordinates
 
 from splashbench.cli.main import main
-from splashbench.container.verification import silhouette
 from splashbench.files import read_gray, read_image, write_png
 from splashbench.observe import Bounds, Grid
 from splashbench.observe.container import depth_image, hidden, solid_distance
-from splashbench.scene import Camera, Scene, SceneMeta, write_scene
-from splashbench.scene.container import ContainerMesh
-from splashbench.synth.balls import write_balls_scene
+from splashbench.scene import Scene, SceneMeta, write_scene
+
+from .painted import bowl, write_painted_scene
 
 # Metres: what a pixel covers there, twice over.
 NEAR = 0.012
 
 
-def bowl() -> ContainerMesh:
-    """An open bowl 70 cm wide, on the floor."""
-    profile = [[0, 0], [0.14, 0], [0.24, 0.07], [0.35, 0.28], [0.32, 0.28], [0.22, 0.10], [0.13, 0.03], [0, 0.03]]
-    body = trimesh.creation.revolve(np.array(profile), sections=64)
-    return ContainerMesh(body.vertices[:, [0, 2, 1]] * [1, 1, -1], body.faces)
-
-
-def paint(image: np.ndarray, free: np.ndarray, camera: Camera, texture: np.ndarray | None) -> np.ndarray:
-    """The bowl drawn into `image` where it is `free`: with `texture` [n, n, n, 3] all around it, or in one colour."""
-    depth = depth_image(bowl(), camera)
-    shown = np.isfinite(depth) & free
-    v, u = np.nonzero(shown)
-    rays = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], axis=1) @ np.linalg.inv(camera.K).T
-    world = (rays * depth[shown][:, None] - camera.w2c[:3, 3]) @ camera.w2c[:3, :3]
-    painted = image.copy()
-    if texture is None:
-        painted[shown] = (150, 120, 90)
-    else:
-        at = ((world + 1) / 2 * (len(texture) - 1)).T
-        painted[shown] = np.stack([map_coordinates(texture[..., c], at, order=1) for c in range(3)], axis=1)
-    return painted
-
-
-def write_bowl_scene(directory: Path, texture: np.ndarray | None) -> Path:
-    """Balls over a bowl, with container masks and nothing else that tells of it."""
-    scene = write_balls_scene(directory, size=(240, 160), n_frames=3)
-    for name, camera in scene.cameras.items():
-        mask = silhouette(bowl(), np.eye(4), camera)
-        write_png(directory / "container_mask" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
-        for t in range(scene.n_frames):
-            image = paint(scene.image(name, t), ~scene.mask(name, t), camera, texture)
-            write_png(directory / "ims" / name / f"{t:06d}.png", image)
-    described = json.loads((directory / "scene.json").read_text())
-    (directory / "scene.json").write_text(json.dumps(described | {"gravity": None, "metres_per_unit": None}))
-    return directory
-
-
 @pytest.fixture(scope="module")
 def textured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     texture = np.random.default_rng(0).uniform(40, 220, (48, 48, 48, 3))
-    return write_bowl_scene(tmp_path_factory.mktemp("bowl") / "bowl", texture)
+    return write_painted_scene(tmp_path_factory.mktemp("bowl") / "bowl", texture)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +182,7 @@ def test_a_mask_without_outline_is_refused(scene: Path, capsys: pytest.CaptureFi
 def test_what_cannot_be_seen_is_refused_and_nothing_changes(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plain = write_bowl_scene(tmp_path / "plain", None)
+    plain = write_painted_scene(tmp_path / "plain", None)
     before = everything(plain)
     assert "a container without texture" in refused(capsys, plain)
     assert "ends in .png" in refused(capsys, plain, "--picture", "picture")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import runpy
 import statistics
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -101,6 +103,12 @@ def test_told_nothing_is_the_mean_of_its_seeds() -> None:
         assert measured["240x160", scene, row, metric] == pytest.approx(
             sum(values) / len(values), abs=0.51 * 10.0 ** -digits[metric]
         )
+    for seed in ("0", "1"):
+        committed = scored("told_nothing_without_masks", seed=seed)
+        for run in runs:
+            if (run["row"], run["seed"]) == ("splashsplat", seed):
+                value = committed[run["scene"], "splashsplat", "best", "24", False][run["metric"]]
+                assert float(run["value"]) == pytest.approx(value, abs=0.51 * 10.0 ** -digits[run["metric"]])
     header, _, *lines = tables("told_nothing.md")[5]
     for scene, *cells in lines:
         for row, cell in zip(header[1:4], cells, strict=False):
@@ -145,20 +153,32 @@ def test_told_nothing_elsewhere_is_what_was_measured(number: int, kind: str) -> 
                 assert float(part.strip(" *†")) == pytest.approx(mean, abs=0.51 * 10**-digits)
 
 
-def test_quality_over_time_is_that_of_the_committed_results() -> None:
-    with (RESULTS / "data" / "quality_over_time.csv").open(encoding="utf-8", newline="") as file:
-        _, *lines = [tuple(line) for line in csv.reader(file)]
-    made = runpy.run_path(str(ROOT / "docs" / "tools" / "quality_over_time.py"))["table"]()
+def quality_over_time(name: str) -> list[tuple[str, ...]]:
+    """The rows of data/quality_over_time*.csv: row, metric, seconds, value."""
+    with (RESULTS / "data" / f"quality_over_time{name}.csv").open(encoding="utf-8", newline="") as file:
+        return [tuple(line) for line in csv.reader(file)][1:]
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "times"), [("", 0, (10, 30, 60, 120, 300)), ("_600x400", 2, (30, 60, 120, 300, 600))]
+)
+def test_quality_over_time_is_that_of_the_committed_results(name: str, number: int, times: tuple[int, ...]) -> None:
+    lines = quality_over_time(name)
+    made = runpy.run_path(str(ROOT / "docs" / "tools" / "quality_over_time.py"))["table"](name)
     assert lines == made
     measured = {(row, metric, seconds): float(value) for row, metric, seconds, value in lines}
-    header, _, *table = first_table("speed.md")
+    header, _, *table = tables("speed.md")[number]
     names = header[1:]
-    assert [line[0] for line in table] == ["10 s", "30 s", "60 s", "120 s", "300 s"]
+    assert [line[0] for line in table] == [f"{seconds} s" for seconds in times]
     for seconds, *cells in table:
-        for name, cell in zip(names, cells, strict=True):
+        for method, cell in zip(names, cells, strict=True):
             for part, metric, digits in zip(cell.split("/"), ("psnr", "lpips", "miou"), (2, 4, 3), strict=True):
-                value = measured[name, metric, seconds.removesuffix(" s")]
+                value = measured[method, metric, seconds.removesuffix(" s")]
                 assert float(part.strip(" *†")) == pytest.approx(value, abs=0.51 * 10**-digits)
+
+
+def test_leads_over_time_are_those_of_the_committed_results() -> None:
+    lines = quality_over_time("")
     leads = {(seconds, metric): (row, float(value)) for row, metric, seconds, value in lines if row.startswith("lead")}
     _, _, *table = tables("speed.md")[1]
     assert [line[0] for line in table] == ["10 s", "30 s", "60 s", "120 s", "300 s"]
@@ -183,6 +203,49 @@ def test_told_all_is_what_was_measured() -> None:
             values = [measured["told all", scene, row, metric] for scene in scenes]
             assert figures[:-1] == pytest.approx(values, abs=1e-9)
             assert figures[-1] == pytest.approx(sum(values) / len(values), abs=0.0051 if metric == "psnr" else 5.1e-4)
+
+
+def scored(*folders: str, seed: str = "0") -> dict[tuple[str, str, str, str, bool], dict[str, Any]]:
+    """Committed results of a seed: metrics by scene, method, preset, version, and whether container masks were used."""
+    found = {}
+    for folder in folders:
+        for path in (ROOT / "leaderboards" / folder / "results").glob(f"*__seed{seed}__*.json"):
+            result = json.loads(path.read_text(encoding="utf-8"))
+            masks = result["settings"].get("container_masks", True)
+            scene = result["scene"].removeprefix("synthetic_")
+            metrics = {name: metric["value"] for name, metric in result["metrics"].items()}
+            found[scene, result["method"], result["preset"], result["method_version"], masks] = metrics
+    return found
+
+
+def test_without_container_masks_is_that_of_the_committed_results() -> None:
+    results = scored("told_nothing", "told_nothing_without_masks")
+    _, _, *lines = tables("told_nothing.md")[6]
+    columns = (
+        ("splashsplat", "best", "24", False),
+        ("splashsplat", "best", "22", True),
+    )
+    scenes = [line[0] for line in lines[:-1]]
+    assert len(scenes) == 6
+    for n, (method, preset, version, masks) in enumerate(columns, start=1):
+        sums = dict.fromkeys(TOLD_NOTHING, 0.0)
+        for line in lines:
+            of = [
+                values
+                for (scene, *who, told, used), values in results.items()
+                if scene == line[0] and who == [method, preset] and version == told and used == masks
+            ]
+            assert len(of) == (line[0] != "mean")
+            for part, metric, digits in zip(line[n].split("/"), TOLD_NOTHING, (2, 4, 3, 3, 4), strict=True):
+                value = of[0][metric] if of else sums[metric] / len(scenes)
+                sums[metric] += of[0][metric] if of else 0
+                assert float(part.strip(" *†")) == pytest.approx(value, abs=0.51 * 10**-digits), (line[0], method)
+    header, _, *quick = tables("told_nothing.md")[7]
+    for (label, *cells), (version, masks) in zip(quick, (("23", False), ("24", False), ("23", True)), strict=True):
+        values = [results[scene, "splashsplat", "quick", version, masks]["psnr"] for scene in header[1:-1]]
+        figures = [float(cell.strip("*")) for cell in cells]
+        assert figures[:-1] == pytest.approx(values, abs=0.0051), label
+        assert figures[-1] == pytest.approx(sum(values) / len(values), abs=0.0051)
 
 
 def test_what_was_withheld_is_what_was_measured() -> None:

@@ -97,6 +97,8 @@ class FileServer:
             request.send_header("Content-Range", f"bytes */{size}")
             request.end_headers()
             return
+        # taken before a header goes out: who has the header may ask anew, on another thread, before this one goes on
+        end = min(size, start + file.cuts.pop(0)) if file.cuts else size
         request.send_response(206 if start else 200)
         if start:
             request.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
@@ -107,7 +109,6 @@ class FileServer:
         if file.cookie:
             request.send_header("Set-Cookie", file.cookie)
         request.end_headers()
-        end = min(size, start + file.cuts.pop(0)) if file.cuts else size
         for position in range(start, end, file.block):
             request.wfile.write(file.content[position : min(end, position + file.block)])
             if file.pause and self.stopped.wait(file.pause):

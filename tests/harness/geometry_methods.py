@@ -6,6 +6,7 @@ import numpy as np
 
 from splashbench.harness.contract import Fitted, Method, MethodConfig, Render, Run
 from splashbench.scene import Camera, Particles, SignedDistance, TrainingScene
+from splashbench.scene.particles import MAX_PARTICLES
 
 
 class _Cube(Fitted):
@@ -47,3 +48,19 @@ class ShortGeometry(Geometry):
 
     def load(self, directory: Path, scene: TrainingScene) -> Fitted:
         return _Cube(scene.n_frames - 1)
+
+
+class _Dust(_Cube):
+    """More particles than a file may hold."""
+
+    def particles(self) -> Particles:
+        positions = np.zeros((self.n_frames, MAX_PARTICLES + 1, 3), np.float32)
+        positions[:, :, 0] = np.arange(MAX_PARTICLES + 1)
+        return Particles(positions, np.ones(positions.shape[:2], bool))
+
+
+class Dust(Geometry):
+    """Hands in too many particles."""
+
+    def load(self, directory: Path, scene: TrainingScene) -> Fitted:
+        return _Dust(scene.n_frames)

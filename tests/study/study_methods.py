@@ -141,3 +141,16 @@ class Grown(Fitted):
     def save(self, directory: Path) -> None:
         (directory / "model.json").write_text(json.dumps(self.said))
         (directory / "weight.bin").write_bytes(bytes(1000 * self.said["size"]))
+
+
+class Accelerated(Grey):
+    """The same, for which SPLASHBENCH_TEST_GPU stands for a GPU. It notes which ones it is given."""
+
+    id, title, version, devices = "accelerated", "one grey on a GPU", "1", ("cpu", "cuda")
+
+    def device_fault(self, device: str) -> str | None:
+        return None if device == "cpu" or os.environ.get("SPLASHBENCH_TEST_GPU") else "there is none"
+
+    def fit(self, scene: TrainingScene, config: Settings, run: Run) -> Fitted:
+        run.note("gpus", os.environ.get("CUDA_VISIBLE_DEVICES", "not said") or "none")
+        return super().fit(scene, config, run)

@@ -117,6 +117,25 @@ def test_means_spreads_and_paired_differences(table: Table) -> None:
     assert dark.difference_std == pytest.approx(0.2887, abs=1e-4)
 
 
+def test_costs_of_a_gpu_and_of_a_processor_have_no_mean(plan: StudyPlan, store: Store) -> None:
+    first = next(run for run in plan.runs if run.variant.name == "dark")
+    entry = store.entry(first.digest)
+    assert entry is not None
+    result = store.result(entry)
+    assert result is not None
+    hardware = {**result.hardware, "gpu": "a card"}
+    write_model(store.results / str(entry.result), result.model_copy(update={"hardware": hardware}))
+    table = make_table(plan, store)
+    full, dark, _ = table.rows
+    assert (full.on_gpu_and_processor, dark.on_gpu_and_processor) == (False, True)
+    assert full.cells["fit_seconds"].mean == 60.0
+    assert dark.cells["fit_seconds"].mean is None
+    assert dark.cells["psnr"].mean is not None
+    assert dark.cells["dynamic_bytes"].mean == 2_500_000.0
+    text = to_markdown(table, COMMAND)
+    assert "some runs were made on a GPU and others not; make all of them on one kind (dark)" in text
+
+
 def test_a_seed_that_lacks_a_scene_has_no_mean(table: Table) -> None:
     row = table.rows[2]
     cell = row.cells["psnr"]

@@ -41,7 +41,7 @@ def test_a_missing_system_library_is_named_with_its_package(missing: str) -> Non
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(simulation, "_PACKAGES", ("no_such_package",))
-    with pytest.raises(SplashbenchError, match=r"no_such_package.*splashbench\[synth\]"):
+    with pytest.raises(SplashbenchError, match=r"no_such_package.*pip install .*\[synth\]"):
         start(QUICK, bowl_mesh(), tmp_path)
 
 

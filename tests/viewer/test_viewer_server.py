@@ -120,7 +120,7 @@ def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         return original(name, *words)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(SplashbenchError, match=r"needs viser.*pip install 'splashbench\[view\]'"):
+    with pytest.raises(SplashbenchError, match=r"needs viser.*pip install -c constraints.txt -e '\.\[view\]'"):
         require_viser()
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from splashbench.background.clean_plate import make_clean_plates
 from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
 from splashbench.observe.grid import Bounds
@@ -38,7 +40,7 @@ Report = Callable[[float, str], None]
 _SHARE_OF_OBSERVABLE = 0.45
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 11
+_REVISION = 12
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class FieldSettings:
     signed_distance: SignedDistanceMethod
     container: bool
     container_masks: bool
+    container_footage: bool
     cut_at_rim: bool
     detect_failed_masks: bool
     replace_empty_masks: bool
@@ -172,15 +175,14 @@ def observe(
             interpolate_times=None if settings.camera_times else False,
             replace_empty=settings.replace_empty_masks,
         )
-        known = known or known_container(scene, settings.container, settings.container_masks)
+        plates = partial(make_clean_plates, scene) if settings.container_footage else None
+        known = known or known_container(scene, settings.container, settings.container_masks, plates)
         container, gravity = known.occlusion, known.gravity
     run.note("container", str(known))
     if gravity is not None:
         run.note(
             "gravity",
-            "of the scene"
-            if scene.gravity is not None
-            else f"along the container's axis, {np.round(gravity, 4).tolist()}",
+            "of the scene" if scene.gravity is not None else f"{known.gravity_from}, {np.round(gravity, 4).tolist()}",
         )
     rim = None
     if container is not None and container.hides and settings.cut_at_rim:

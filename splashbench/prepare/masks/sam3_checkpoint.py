@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, read_model, validate_model
 
-INSTALL = "pip install 'splashbench[sam3]'"
+INSTALL = "in a checkout: pip install -c constraints.txt -e '.[sam3]'"
 # Of config.json: the whole published checkpoint, or one of the two models in it.
 _FINDING = ("sam3_video", "sam3")
 _FOLLOWING = ("sam3_video", "sam3_tracker_video")

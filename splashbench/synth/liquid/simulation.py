@@ -74,7 +74,7 @@ def check_packages() -> None:
         if importlib.util.find_spec(package) is None:
             raise SplashbenchError(
                 f"synthetic liquids need the package {package}, which is missing; "
-                "install it with: pip install 'splashbench[synth]'"
+                "install it in a checkout: pip install -c constraints.txt -e '.[synth]'"
             )
 
 

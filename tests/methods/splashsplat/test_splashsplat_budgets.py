@@ -1,18 +1,22 @@
-"""Budgets of seconds and bytes: kept, spent on finer grids where there is more, and recorded with their evidence."""
+"""Budgets of seconds, bytes and memory: kept, spent on finer grids where there is more, told with their evidence."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from splashbench.errors import SplashbenchError
 from splashbench.files import tree_bytes
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench.submission import Budget
-from splashbench_methods.splashsplat import SplashSplat
+from splashbench_methods.splashsplat import SplashSplat, affordable_memory
 from splashbench_methods.splashsplat.affordable import background_update, with_cells, within_seconds
+from splashbench_methods.splashsplat.affordable_memory import within_memory
 from splashbench_methods.splashsplat.appearance.schedule import LOWEST, Clock, TimedSchedule
 from splashbench_methods.splashsplat.method import FittedSplashSplat
 from splashbench_methods.splashsplat.settings import SplashSplatConfig
@@ -111,3 +115,98 @@ def test_coarser_grids_keep_their_proportions() -> None:
     small = background_update(config, Run(budget=Budget(storage_bytes=200_000)))
     assert small["max_anchors"] < 1500
     assert background_update(config, Run()) == {}
+
+
+class Traces:
+    """Stands for traces of a scene that needs `full` cells, with carriers by a power of its own, and counts them."""
+
+    def __init__(self, full: int, growth: float, carriers: int = 800_000) -> None:
+        self.full, self.growth, self.carriers = full, growth, carriers
+        self.asked: list[int] = []
+
+    def __call__(self, config: SplashSplatConfig) -> Any:
+        cells = min(config.hull_cells, self.full)
+        self.asked.append(cells)
+        count = round(self.carriers * (cells / 300) ** self.growth)
+        return SimpleNamespace(
+            observations=SimpleNamespace(hull_grid=SimpleNamespace(shape=(cells + 1, 10, 10))),
+            track=SimpleNamespace(
+                carriers=SimpleNamespace(count=count), phi=SimpleNamespace(nbytes=round(107e6 * (cells / 300) ** 3))
+            ),
+        )
+
+
+def peak_of(traced: Any, scene: Scene) -> float:
+    fixed = affordable_memory._fixed_bytes(scene.training(), 370_000_000)
+    return affordable_memory._size_of(traced, fixed).peak
+
+
+@pytest.mark.parametrize("growth", [1.9, 2.4, 2.9])
+@pytest.mark.parametrize("megabytes", [640, 700, 850, 1000, 1300, 3000])
+def test_memory_chooses_the_finest_grids_that_it_leaves_room_for(balls: Scene, growth: float, megabytes: int) -> None:
+    config = SplashSplatConfig.preset("best")
+    trace, run = Traces(300, growth), Run(budget=Budget(memory_bytes=megabytes * 10**6))
+    traced: Any = within_memory(balls.training(), config, run, 370_000_000, trace)
+    assert len(trace.asked) <= 4
+    assert peak_of(traced, balls) <= 1.02 * megabytes * 1e6
+    finest = trace.asked[-1] == 300
+    assert finest or peak_of(traced, balls) > 0.85 * megabytes * 1e6
+    assert finest == (peak_of(Traces(300, growth)(config), balls) <= 0.98 * megabytes * 1e6)
+    (decision,) = run.decisions
+    assert decision.name == "grids for the memory"
+    assert [rung.bought for rung in decision.rungs] == [False] * (len(trace.asked) - 1) + [True]
+    assert decision.chosen.startswith(f"{trace.asked[-1]} cells, ")
+
+
+def test_a_scene_that_needs_few_cells_is_traced_once(balls: Scene) -> None:
+    trace, run = Traces(100, 2.4), Run(budget=Budget(memory_bytes=10**12))
+    within_memory(balls.training(), SplashSplatConfig.preset("best"), run, 370_000_000, trace)
+    assert trace.asked == [100]
+
+
+def test_memory_that_nothing_fits_into_has_the_coarsest_grids(balls: Scene) -> None:
+    trace, run = Traces(300, 2.4), Run(budget=Budget(memory_bytes=1))
+    traced: Any = within_memory(balls.training(), SplashSplatConfig.preset("best"), run, 370_000_000, trace)
+    assert trace.asked[-1] == 24
+    assert peak_of(traced, balls) > 1
+    assert "0 MB are to be kept, of which 586 are there on any grid" in run.decisions[0].because
+
+
+def test_carriers_of_no_liquid_are_no_trouble(balls: Scene) -> None:
+    trace, run = Traces(300, 2.4, carriers=0), Run(budget=Budget(memory_bytes=700 * 10**6))
+    within_memory(balls.training(), SplashSplatConfig.preset("best"), run, 370_000_000, trace)
+    assert trace.asked[-1] > 128
+
+
+def test_a_fit_within_memory_has_the_grids_that_it_leaves_room_for(balls: Scene) -> None:
+    free, _ = fit(balls, Budget())
+    roomy, run = fit(balls, Budget(memory_bytes=10**12))
+    assert [decision.name for decision in run.decisions] == ["grids for the memory", "steps of stored values"]
+    for name, arrays in free.liquid.arrays.items():
+        for key, array in arrays.items():
+            np.testing.assert_array_equal(roomy.liquid.arrays[name][key], array)
+    tight, run = fit(balls, Budget(memory_bytes=1))
+    assert run.decisions[0].chosen.startswith("24 cells, ")
+    assert tight.liquid.track.carriers.count < free.liquid.track.carriers.count / 2
+
+
+def test_all_budgets_together_take_the_coarsest_of_their_grids(balls: Scene, tmp_path: Path) -> None:
+    limit = 120_000
+    fitted, run = fit(balls, Budget(seconds=60, storage_bytes=limit, memory_bytes=10**12))
+    assert {"grids for the memory", "grids for the seconds"} <= {decision.name for decision in run.decisions}
+    assert stored_bytes(fitted, tmp_path / "fitted") <= 1.05 * limit
+
+
+def test_a_budget_of_memory_is_the_processors(balls: Scene) -> None:
+    run = Run(device="cuda", budget=Budget(memory_bytes=10**12))
+    with pytest.raises(SplashbenchError, match="a budget of memory on the processor alone; give --device cpu"):
+        SplashSplat().fit(balls.training(), SplashSplat.Config.preset("quick", SMALL), run)
+
+
+def test_in_a_hurry_there_is_one_trace_at_full_length(balls: Scene) -> None:
+    config, budget = SplashSplatConfig.preset("best"), Budget(memory_bytes=1200 * 10**6, seconds=60)
+    patient, hurried = Traces(300, 1.8), Traces(300, 1.8)
+    within_memory(balls.training(), config, Run(budget=Budget(memory_bytes=1200 * 10**6)), 370_000_000, patient)
+    within_memory(balls.training(), config, Run(budget=budget), 370_000_000, hurried)
+    assert hurried.asked == patient.asked[:2]
+    assert len(patient.asked) > 2

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import trimesh
 
+from splashbench.background.support import Support
+from splashbench.container.footage_vessel import Standing
+from splashbench.container.found_vessel import FoundVessel
 from splashbench.container.verification import silhouette
+from splashbench.container.vessel_body import VesselBody, frame_about, superellipse
 from splashbench.observe import signed_distance_fields
 from splashbench.observe.container import depth_image
 from splashbench.scene.camera import Camera, look_at
@@ -69,6 +73,66 @@ def known(scene: BallInABowl, mesh: bool = True, masks: bool = True) -> Any:
     return known_container(cast(TrainingScene, scene), mesh, masks)
 
 
+def found(held: float = 0.97, share: float = 0.8, tilt: float = 0.0) -> Standing:
+    """A surface, and the bowl that stands on it, as the footage shows them."""
+    up = np.array([tilt, 1.0, 0.0]) / np.hypot(tilt, 1.0)
+    heights, radii = np.array([0, 0.02, 0.1]), np.array([0.05, 0.08, 0.1])
+    body = VesselBody(np.zeros(3), frame_about(-DOWN), superellipse(0.0, 2.0, 0.0, 48), heights, radii)
+    return Standing(Support(up, 0.0, share), FoundVessel(body, (held, held), 2.0, 0.1))
+
+
+def in_footage(monkeypatch: pytest.MonkeyPatch, standing: Standing, scene: BallInABowl, masks: bool = True) -> Any:
+    """The container where masks are looked at, if so, and then the footage, which shows `standing`."""
+    monkeypatch.setattr(
+        "splashbench_methods.splashsplat.fields.container.standing_about_liquid", lambda scene, plates: standing
+    )
+    return known_container(cast(TrainingScene, scene), True, masks, dict)
+
+
+def test_without_masks_the_footage_tells_gravity_and_what_is_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = BallInABowl(masked=False)
+    container = in_footage(monkeypatch, found(), scene)
+    assert container.source == "footage"
+    assert container.occlusion.hides
+    assert "clean plates" in str(container)
+    assert container.gravity == pytest.approx(DOWN)
+    assert "surface" in container.gravity_from
+    fields = signed_distance_fields(cast(TrainingScene, scene), 64, container=container.occlusion)
+    assert fields.sample(0, (MIDDLE - [0, 0.8 * RADIUS, 0])[None])[0] < 0
+    assert not in_footage(monkeypatch, found(), BallInABowl(masked=False, transparent=True)).occlusion.hides
+    # What is stated stays, and masks come first.
+    tilted = found(tilt=0.1)
+    assert in_footage(monkeypatch, tilted, BallInABowl(masked=False, gravity=DOWN)).gravity is DOWN
+    assert in_footage(monkeypatch, tilted, BallInABowl()).source == "masks"
+    assert in_footage(monkeypatch, tilted, BallInABowl(), masks=False).source == "footage"
+
+
+def test_what_is_not_trusted_in_the_footage_tells_gravity_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    doubtful = in_footage(monkeypatch, found(held=0.5), BallInABowl(masked=False))
+    assert (doubtful.source, doubtful.occlusion) == ("none", None)
+    assert doubtful.gravity == pytest.approx(DOWN)
+    assert "holds 0.50 of what stands" in str(doubtful)
+    uneven = in_footage(monkeypatch, found(held=0.5, share=0.2), BallInABowl(masked=False))
+    assert uneven.gravity is None
+    # A vessel says by itself how it stands.
+    alone = in_footage(monkeypatch, found(share=0.2, tilt=0.3), BallInABowl(masked=False))
+    assert alone.gravity == pytest.approx(DOWN)
+    # Glass through which no liquid is seen is none, and says no more.
+    held = found(share=0.2)
+    assert held.vessel is not None
+    glass = replace(held, vessel=replace(held.vessel, seen_through=True))
+    opaque = in_footage(monkeypatch, glass, BallInABowl(masked=False))
+    assert (opaque.occlusion, opaque.gravity) == (None, None)
+    assert "no liquid shows through walls" in str(opaque)
+    clear = in_footage(monkeypatch, glass, BallInABowl(masked=False, transparent=True))
+    assert (clear.source, clear.occlusion.hides) == ("footage", False)
+    refused = replace(held, vessel=replace(held.vessel, refused="the rim is beyond the images"))
+    assert "the rim is beyond" in str(in_footage(monkeypatch, refused, BallInABowl(masked=False)))
+    nothing = in_footage(monkeypatch, Standing(None, None), BallInABowl(masked=False))
+    assert (nothing.occlusion, nothing.gravity) == (None, None)
+    assert "nothing that rises" in str(nothing)
+
+
 def test_the_masks_tell_gravity_and_what_is_hidden() -> None:
     scene = BallInABowl()
     container = known(scene)
@@ -101,6 +165,15 @@ def test_what_the_scene_states_comes_first() -> None:
     assert stated.source == "masks"
     assert stated.gravity is DOWN
     assert not stated.occlusion.hides
+
+
+def test_masks_that_are_not_looked_at_are_not_read() -> None:
+    def unreadable(camera: str) -> np.ndarray | None:
+        raise AssertionError(f"read the mask of {camera}")
+
+    scene = BallInABowl()
+    scene.container_mask = unreadable  # type: ignore[method-assign]
+    assert known(scene, masks=False).source == "none"
 
 
 @pytest.mark.parametrize(("mesh", "masks"), [(False, False), (True, False)])

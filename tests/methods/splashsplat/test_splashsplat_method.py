@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Run
 from splashbench.render import rasterize_arrays
 from splashbench.scene import Scene
+from splashbench.scene.particles import Particles
 from splashbench.synth.balls import ball_centers, write_balls_scene
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.appearance.targets import collect_targets
@@ -123,6 +125,28 @@ def test_particles_are_the_carriers_near_the_balls(balls: Scene, fitted: FittedS
         distance = np.linalg.norm(particles.at(t)[:, None] - ball_centers(balls.times[t]), axis=2).min(axis=1)
         assert np.median(distance) < 0.12  # the largest ball's radius is 0.1
     assert np.isfinite(particles.velocities).all()
+
+
+def test_more_carriers_than_a_file_of_particles_holds_hand_out_an_even_share(
+    fitted: FittedSplashSplat, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    liquid, whole = fitted.liquid, fitted.particles()
+    most = liquid.carriers.count // 3
+    monkeypatch.setattr("splashbench.scene.particles.MAX_BYTES", (1 << 16) + 25 * liquid.carriers.n_frames * most)
+    chosen = liquid.handed_out
+    assert len(chosen) == most
+    assert {*np.diff(chosen).tolist()} <= {3, 4}
+    part = fitted.particles()
+    np.testing.assert_array_equal(part.positions, whole.positions[:, chosen])
+    np.testing.assert_array_equal(part.active, whole.active[:, chosen])
+    assert part.velocities is not None
+    assert whole.velocities is not None
+    np.testing.assert_array_equal(part.velocities, whole.velocities[:, chosen])
+    part.save(tmp_path / "particles.npz")
+    assert Particles.load(tmp_path / "particles.npz").positions.shape == part.positions.shape
+    with pytest.raises(SplashbenchError, match="unpacks to more than"):
+        whole.save(tmp_path / "whole.npz")
+        Particles.load(tmp_path / "whole.npz")
 
 
 def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, fitted: FittedSplashSplat):

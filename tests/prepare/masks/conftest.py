@@ -92,7 +92,7 @@ def write_tokenizer(folder: Path) -> None:
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder like that of the published checkpoint, with random weights."""
-    pytest.importorskip("transformers", reason="needs transformers: pip install 'splashbench[sam3]'")
+    pytest.importorskip("transformers", reason="needs transformers, of the extra [sam3]")
     import torch
     from transformers import Sam3VideoConfig
     from transformers.models.sam3_video.modeling_sam3_video import Sam3VideoModel

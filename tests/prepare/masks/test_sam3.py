@@ -24,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated
 WIDTH, HEIGHT = 90, 60
 SIZE = 56  # of the checkpoint's images, see conftest
 needs_transformers = pytest.mark.skipif(
-    importlib.util.find_spec("transformers") is None, reason="needs transformers: pip install 'splashbench[sam3]'"
+    importlib.util.find_spec("transformers") is None, reason="needs transformers, of the extra [sam3]"
 )
 
 
@@ -299,6 +299,6 @@ def test_prompts_that_make_no_sense_are_one_line(checkpoint: Path) -> None:
 
 def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SplashbenchError, match=r"pip install 'splashbench\[sam3\]'") as caught:
+    with pytest.raises(SplashbenchError, match=r"pip install -c constraints.txt -e '\.\[sam3\]'") as caught:
         provider(tmp_path)
     assert "\n" not in str(caught.value)

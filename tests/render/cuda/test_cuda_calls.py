@@ -132,7 +132,7 @@ def test_importing_it_needs_no_gsplat_and_no_device() -> None:
     ("spoil", "reason"),
     [
         (lambda m: m.setattr(torch.cuda, "is_available", lambda: False), "PyTorch sees no CUDA device; use backend="),
-        (lambda m: m.setitem(sys.modules, "gsplat", None), r"pip install 'splashbench\[cuda\]'"),
+        (lambda m: m.setitem(sys.modules, "gsplat", None), r"pip install -c constraints.txt -e '\.\[cuda\]'"),
         (
             lambda m: m.setattr(sys.modules["gsplat"], "__version__", "1.6.0"),
             "version 1.6.0.*; pip install gsplat==1.5.3",

@@ -40,9 +40,9 @@ class Cluster:
         self.marks.append(mark)
         return ended.stdout
 
-    def join(self, before: tuple[str, ...] = ()) -> None:
-        """Start another machine. before: words in front of the command."""
-        self._start(f"--address={self.address}", before=before)
+    def join(self, *words: str, before: tuple[str, ...] = ()) -> None:
+        """Start another machine. words: more of Ray's options. before: words in front of the command."""
+        self._start(f"--address={self.address}", *words, before=before)
 
     def processes(self, machine: int) -> list[psutil.Process]:
         found = []
@@ -146,6 +146,25 @@ def test_a_machine_that_does_not_see_the_folder_is_named(
     error = [line for line in said.splitlines() if line.startswith("error: ")]
     assert len(error) == 1
     assert f"does not see {tmp_path / 'place' / 'out' / 'cache'}; put it on a file system that every" in error[0]
+
+
+def test_a_gpu_is_given_to_methods_that_can_use_one(cluster: Cluster, balls_directory: Path, tmp_path: Path) -> None:
+    """Ray counts a GPU that this machine need not have, and tells work which one it has."""
+    methods = Path(__file__).parents[1] / "study_methods.py"
+    variants = [{"name": "full", "method": f"{methods}:Accelerated"}, {"name": "grey", "method": f"{methods}:Grey"}]
+    spec = write_spec(tmp_path, balls_directory, method=f"{methods}:Grey", variants=variants, device="auto")
+    place = ["--on", f"ray://{cluster.address}"]
+    assert study(spec, tmp_path / "none", *place)[0] == 0
+    assert _gpus(tmp_path / "none") == {"full": "none", "grey": None}
+    cluster.join("--num-gpus=1")
+    code, said = study(spec, tmp_path / "one", *place, SPLASHBENCH_TEST_GPU="1")
+    assert code == 0, said
+    assert _gpus(tmp_path / "one") == {"full": "0", "grey": None}
+
+
+def _gpus(out: Path) -> dict[str, str | None]:
+    """What each run notes of the GPUs that it sees."""
+    return {title.split("__")[1]: entry["record"]["notes"].get("gpus") for title, entry in entries(out).items()}
 
 
 def test_work_that_no_machine_has_room_for_is_refused(cluster: Cluster, balls_directory: Path, tmp_path: Path) -> None:
