@@ -90,9 +90,10 @@ class Course:
         return self._at_once()
 
     def _draft(self, show: Callable[[Callable[[], State], bool], None]) -> State:
-        self._run.progress(0, "draft")
-        with self._run.stage("draft"):
-            return make_draft(self._scene, self._config, self._run.aside(), self._container(), self._plates, show)
+        run, known = self._run, self._stated_container()
+        run.progress(0, "draft")
+        with run.stage("draft"):
+            return make_draft(self._scene, self._config, run.aside(), known, self._plates, show)
 
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
@@ -105,6 +106,15 @@ class Course:
             run.note("self-calibration", "; ".join(found.lines(self._scene.cameras)))
             self._scene, self._known = found.scene(self._scene), None
             self._plates = _plates_of(self._scene)
+
+    def _stated_container(self) -> KnownContainer:
+        """By mesh or masks. To look for it in the footage takes as long as a draft, which gains a decibel by it."""
+        config = self._config
+        with self._run.stage("container"):
+            known = known_container(self._scene, config.container, config.container_masks)
+        if known.occlusion is not None:
+            self._known = known
+        return known
 
     def _container(self) -> KnownContainer:
         """Looked for once, for all traces."""

@@ -21,6 +21,7 @@ from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.fitting import Fit
 from splashbench_methods.splashsplat.appearance.warm_start import Learned
 from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.fields import container
 from splashbench_methods.splashsplat.method import FittedSplashSplat
 
 SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 6, "velocity_steps": 2, "self_calibration": False}
@@ -112,6 +113,20 @@ def test_who_looks_on_changes_nothing(
         found = fitted(balls, run, iterations=40, draft_cells=32)
         images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
     np.testing.assert_array_equal(*images)
+
+
+def test_a_draft_does_not_wait_for_a_container_that_the_footage_has_to_show(
+    balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    draft, look = course.make_draft, container.standing_about_liquid
+    monkeypatch.setattr(course, "make_draft", lambda *given: (draft(*given), done.append("draft"))[0])
+    monkeypatch.setattr(container, "standing_about_liquid", lambda *given: (look(*given), done.append("container"))[0])
+    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    run = Run()
+    run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
+    fitted(balls, run, iterations=20, draft_cells=32, container=False, container_masks=False)
+    assert done == ["draft", "container"]
 
 
 @pytest.fixture
