@@ -176,22 +176,23 @@ class Course:
                 f"{100 * _TRANSPARENT:.0f} % on the background comes first",
             )
         )
-        container = self._container()  # for both traces
         if not transparent:
             self._drafted = None
-            learned = self._coarse(behind, container, 0)
+            learned = self._coarse(behind, self._container(), 0)
             late, traced = run.ahead(self._fitted_background, self._trace, (_COARSE, _COARSE + _BEFORE))
             return self._fine(behind, traced, _COARSE + _BEFORE, late, learned)
         # Who has cores makes the trace beside the background. Nothing is shown then: a state is saved outside the
         # clock, and the other part would go on meanwhile.
         alone = thread_count() == 1
+        if not alone:
+            self._container()  # for the trace
         late_trace, background = run.ahead(
             self._trace, lambda part: self._fitted_background(part, alone), (0, _BACKGROUND)
         )
         self._offer_behind_draft(lambda: background, True)
         self._background, self._drafted = background, None
         behind = background.seen_by(self._scene)
-        learned = self._coarse(behind, container, _BACKGROUND)
+        learned = self._coarse(behind, self._container(), _BACKGROUND)
         return self._fine(behind, late_trace(), _COARSE + _BEFORE, None, learned)
 
     def _coarse(self, behind: Backgrounds, container: KnownContainer, start: float) -> list[Learned]:

@@ -77,7 +77,8 @@ class SplashSplatConfig(MethodConfig):
     container_masks: bool = True
     #: without mesh and container masks: the upright vessel that the footage shows where the liquid is
     container_footage: bool = True
-    #: liquid is cut by pixels where the near wall of an opaque container hides it (needs gravity or container masks)
+    #: liquid is cut by pixels where the near wall of an opaque container hides it (needs gravity, or a container in
+    #: masks or footage)
     cut_at_rim: bool = True
     #: the box of the grids holds every frame's hull, or else the hull of all masks together; where failed masks are
     #: looked for, always the first
@@ -92,7 +93,7 @@ class SplashSplatConfig(MethodConfig):
     repeats: bool = True
     #: carve, and compare photographs, at each camera's own times, where the scene has them
     camera_times: bool = True
-    #: level the liquid that rests in the container (needs the mesh and gravity)
+    #: level the liquid that rests in the container (needs gravity and the mesh, or a container in masks or footage)
     pool: bool = True
     # Velocity
     #: free fall for the jet (needs gravity, the metric scale and the frames' times)

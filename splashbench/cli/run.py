@@ -18,9 +18,11 @@ _EPILOG = """\
 examples:
   splashbench run splashsplat scenes/bowl_001 submissions/bowl_001/splashsplat
   splashbench run splashsplat SCENE OUT --preset quick --seed 1 --set iterations=500
+  splashbench run splashsplat SCENE OUT --preset auto   no larger than the scene needs
   splashbench run splashsplat SCENE OUT --checkpoints   with its quality over time, for `score` and `leaderboard`
   splashbench run splashsplat SCENE OUT --budget-seconds 60 --budget-mb 2
   splashbench run splashsplat SCENE OUT --budget-memory 800     within 800 MB of memory, on coarser grids
+  splashbench run splashsplat SCENE OUT --withhold odd --exr    fitted to every second timestep; OpenEXR, too
   splashbench run nothing SCENE OUT                 the frozen background alone, the reference for dPSNR
   splashbench run oracle SCENE OUT                  the ground truth itself, a check of the scoring
   splashbench run my_method.py:MyMethod SCENE OUT   a method that is not installed (CONTRIBUTING.md)

@@ -1,4 +1,4 @@
-"""What is known of the container: from the scene's mesh, or else from the container masks. Not in the paper.
+"""What is known of the container: from the scene's mesh, the container masks or the footage. Not in the paper.
 
 One answer serves carving, drawing, and what a view may teach. It comes from the best source that there is.
 - The scene's mesh, with its gravity.

@@ -20,7 +20,7 @@ examples:
   splashbench methods test my_method.py:MyMethod --only load same_seed
   splashbench methods test my_method.py:MyMethod --scene scenes/bowl_001 --preset best
 
-Makes a small scene, fits it about five times, and prints a line for each check: ok; warning (allowed, worth a look);
+Makes a small scene, fits it about six times, and prints a line for each check: ok; warning (allowed, worth a look);
 FAILED with a remedy; not tested, where an earlier fault hides the answer. docs/conformance.md explains the checks.
 The test finds mistakes, not malice. A method is a program with your rights: run a stranger's in a container.
 """

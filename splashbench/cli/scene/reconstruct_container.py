@@ -16,8 +16,9 @@ examples:
 
 For an opaque container without a scan (with one: `splashbench scene place-container`). A plane sweep over what stands
 still finds the surface, within container_mask/ of the training cameras. The masks of the test cameras verify it. The
-container needs texture, and views that overlap. splashsplat then knows what the container hides. Gravity and metric
-scale stay as they are. SCENE has another digest then: run methods again.
+container needs texture, and views that overlap. splashsplat then knows what the container hides; without it it looks
+for an upright vessel by itself. Gravity and metric scale stay as they are. SCENE has another digest then: run methods
+again.
 """
 
 

@@ -22,7 +22,7 @@ examples:
 It looks at the training views alone: at what they show in common of the still surroundings, and at droplets in their
 masks; and it holds masks against photographs. --out writes a copy for any method to be run on: photographs evenly
 exposed and straightened, with the cameras, the clocks and the masks that were found. Test views stay as they are.
-splashsplat does the same by itself before it fits. `splashbench masks` draws the outlines of the copy to look at.
+splashsplat does the same by itself before it fits. `splashbench masks sheet OUT --out PNG` draws its outlines.
 """
 
 

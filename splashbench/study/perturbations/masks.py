@@ -55,7 +55,7 @@ class EmptyMasks(MaskShare):
     kind: Literal["empty_masks"]
     share: float = Field(ge=0, le=1)
     unit: ClassVar[str] = "share of masks"
-    remedy: ClassVar[str] = "Look through the masks (`splashbench masks`), and mend or leave out those that failed."
+    remedy: ClassVar[str] = "Look through masks (`splashbench masks sheet`), and mend or leave out those that failed."
     ladder: ClassVar[tuple[float, ...]] = (0.02, 0.05, 0.086, 0.15, 0.3)
     measured: ClassVar[str] = "share"
 
