@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from splashbench.container.footage_vessel import Standing, StandingSearch
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Decision, Run
 from splashbench.parallel import thread_count
@@ -70,7 +71,7 @@ class Course:
         # Of the process before the fit, which a budget of memory has to know.
         self._loaded = 0 if run.budget.memory_bytes is None else sum(resident_bytes(os.getpid()).values())
         self._known: KnownContainer | None = None
-        self._plates: Callable[[], Plates] = _plates_of(scene)
+        self._look_anew()
         # Of its settings, those that a budget asks for.
         self._smaller_background: dict[str, int] = {}
         # What is shown until there is something better; large.
@@ -90,10 +91,19 @@ class Course:
         return self._at_once()
 
     def _draft(self, show: Callable[[Callable[[], State], bool], None]) -> State:
-        run, known = self._run, self._stated_container()
+        run, known = self._run, self._rough_container()
         run.progress(0, "draft")
         with run.stage("draft"):
             return make_draft(self._scene, self._config, run.aside(), known, self._plates, show)
+
+    def _look_anew(self) -> None:
+        """What the footage of the scene tells is looked for once each."""
+        from ..scaffold_gs import clean_plates
+
+        scene = self._scene
+        plates: Callable[[], Plates] = cache(lambda: clean_plates(scene))
+        self._plates = plates
+        self._standing = cache(lambda: StandingSearch(scene, plates()))
 
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
@@ -105,25 +115,26 @@ class Course:
         if found:
             run.note("self-calibration", "; ".join(found.lines(self._scene.cameras)))
             self._scene, self._known = found.scene(self._scene), None
-            self._plates = _plates_of(self._scene)
+            self._look_anew()
 
-    def _stated_container(self) -> KnownContainer:
-        """By mesh or masks. To look for it in the footage takes as long as a draft, which gains a decibel by it."""
-        config = self._config
-        with self._run.stage("container"):
-            known = known_container(self._scene, config.container, config.container_masks)
-        if known.occlusion is not None:
+    def _rough_container(self) -> KnownContainer:
+        """For a draft, which does not wait for what takes the footage longer to tell."""
+        known = self._look_for_container(lambda: self._standing().roughly())
+        if known.source in ("mesh", "masks"):
             self._known = known
         return known
 
     def _container(self) -> KnownContainer:
         """Looked for once, for all traces."""
         if self._known is None:
-            config = self._config
-            plates = self._plates if config.container_footage else None
-            with self._run.stage("container"):
-                self._known = known_container(self._scene, config.container, config.container_masks, plates)
+            self._known = self._look_for_container(lambda: self._standing().found())
         return self._known
+
+    def _look_for_container(self, standing: Callable[[], Standing]) -> KnownContainer:
+        config = self._config
+        footage = standing if config.container_footage else None
+        with self._run.stage("container"):
+            return known_container(self._scene, config.container, config.container_masks, footage)
 
     def _stand_in(self) -> Backgrounds:
         """What lies behind the liquid of every training view before the background is fitted."""
@@ -271,10 +282,3 @@ class Course:
         views = {name: self._scene.cameras[name] for name in self._scene.train}
         frozen = {name: freeze(*background.gaussians(camera), camera) for name, camera in views.items()}
         return self._fine(dict.fromkeys(views, background.far_color), traced, _BEFORE, frozen=frozen)
-
-
-def _plates_of(scene: TrainingScene) -> Callable[[], Plates]:
-    """Makes the clean plates of `scene`, once."""
-    from ..scaffold_gs import clean_plates
-
-    return cache(lambda: clean_plates(scene))

@@ -1,8 +1,8 @@
 """A first reconstruction within seconds, for those who look at a fit on its way. Not in the paper.
 
 It is the method itself on coarse grids: carriers of each frame alone, which nothing moves, fitted for a moment to the
-photographs, before one colour at first and then before a background as coarse. Of the container it is told what takes
-no search of the footage. Nothing of it enters the fit.
+photographs, before one colour at first and then before a background as coarse. A container that only the footage shows
+is known roughly. Nothing of it enters the fit.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ class FoundVessel(Vessel):
             before its outline was moved to edges, and after. Of one that is seen through: the share of the liquid that
             an upright body holds, and the vessel.
         contrast: how strong edges along its outline are, by those along outlines a little smaller and larger; 0 where
-            it was refused before.
+            it was refused before, infinite where no edge was looked at.
         beside: how far from its axis the liquid is in the middle, in radii of its widest ring.
         seen_through: whether liquid that rests in it spoke for it, not depths of its own.
         refused: why the search for it gave up, in words; empty where it did not.

@@ -11,15 +11,14 @@ A vessel's axis tells gravity. Whether liquid is seen through its walls tells wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from splashbench.background.clean_plate import CleanPlate
-from splashbench.container.footage_vessel import standing_about_liquid
+from splashbench.container.footage_vessel import Standing
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.vessel_body import Vessel
 from splashbench.observe.occlusion import ContainerOcclusion
@@ -66,10 +65,10 @@ def known_container(
     scene: TrainingScene,
     mesh: bool,
     from_masks: bool,
-    plates: Callable[[], Mapping[str, CleanPlate]] | None = None,
+    footage: Callable[[], Standing] | None = None,
 ) -> KnownContainer:
-    """What `scene` states or shows of its container. mesh, from_masks: which sources to look at. plates: make the clean
-    plates of the training views, as large as these; None where the footage is not to be looked at."""
+    """What `scene` states or shows of its container. mesh, from_masks: which sources to look at. footage: finds what
+    stands about the liquid (footage_vessel.py); None where the footage is not to be looked at."""
     stated = ContainerOcclusion.of(scene) if mesh else None
     if stated is not None:
         return KnownContainer(stated, scene.gravity, "mesh")
@@ -77,7 +76,7 @@ def known_container(
     masks = {name: mask for name in names if (mask := scene.container_mask(name)) is not None}
     if masks:
         return _in_masks(scene, masks)
-    return KnownContainer(None, scene.gravity, "none") if plates is None else _in_footage(scene, plates())
+    return KnownContainer(None, scene.gravity, "none") if footage is None else _in_footage(scene, footage())
 
 
 def _in_masks(scene: TrainingScene, masks: dict[str, np.ndarray]) -> KnownContainer:
@@ -90,9 +89,8 @@ def _in_masks(scene: TrainingScene, masks: dict[str, np.ndarray]) -> KnownContai
     return KnownContainer(_occlusion(scene, vessel, masks, gravity), gravity, "masks")
 
 
-def _in_footage(scene: TrainingScene, plates: Mapping[str, CleanPlate]) -> KnownContainer:
-    """The vessel, or the surface at least, that the clean plates show where the liquid is."""
-    found = standing_about_liquid(scene, plates)
+def _in_footage(scene: TrainingScene, found: Standing) -> KnownContainer:
+    """The vessel, or the surface at least, that was `found` where the liquid is."""
     gravity, vessel = scene.gravity, found.vessel
     if gravity is None and found.support is not None and found.support.share >= _LEVEL:
         gravity = -found.support.normal

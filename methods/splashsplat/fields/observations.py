@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from splashbench.background.clean_plate import make_clean_plates
+from splashbench.container.footage_vessel import Standing, standing_about_liquid
 from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
 from splashbench.observe.grid import Bounds
@@ -160,6 +161,10 @@ def pack_signed_distance(phi: np.ndarray) -> np.ndarray:
     return SignedDistance.of(phi[None], np.zeros(3), 1.0).phi[0]
 
 
+def _standing(scene: TrainingScene) -> Standing:
+    return standing_about_liquid(scene, make_clean_plates(scene))
+
+
 def observe(
     scene: TrainingScene, settings: FieldSettings, run: Run, report: Report, known: KnownContainer | None = None
 ) -> Observations:
@@ -175,8 +180,9 @@ def observe(
             interpolate_times=None if settings.camera_times else False,
             replace_empty=settings.replace_empty_masks,
         )
-        plates = partial(make_clean_plates, scene) if settings.container_footage else None
-        known = known or known_container(scene, settings.container, settings.container_masks, plates)
+        if known is None:
+            footage = partial(_standing, scene) if settings.container_footage else None
+            known = known_container(scene, settings.container, settings.container_masks, footage)
         container, gravity = known.occlusion, known.gravity
     run.note("container", str(known))
     if gravity is not None:

@@ -81,17 +81,14 @@ def found(held: float = 0.97, share: float = 0.8, tilt: float = 0.0) -> Standing
     return Standing(Support(up, 0.0, share), FoundVessel(body, (held, held), 2.0, 0.1))
 
 
-def in_footage(monkeypatch: pytest.MonkeyPatch, standing: Standing, scene: BallInABowl, masks: bool = True) -> Any:
+def in_footage(standing: Standing, scene: BallInABowl, masks: bool = True) -> Any:
     """The container where masks are looked at, if so, and then the footage, which shows `standing`."""
-    monkeypatch.setattr(
-        "splashbench_methods.splashsplat.fields.container.standing_about_liquid", lambda scene, plates: standing
-    )
-    return known_container(cast(TrainingScene, scene), True, masks, dict)
+    return known_container(cast(TrainingScene, scene), True, masks, lambda: standing)
 
 
-def test_without_masks_the_footage_tells_gravity_and_what_is_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_masks_the_footage_tells_gravity_and_what_is_hidden() -> None:
     scene = BallInABowl(masked=False)
-    container = in_footage(monkeypatch, found(), scene)
+    container = in_footage(found(), scene)
     assert container.source == "footage"
     assert container.occlusion.hides
     assert "clean plates" in str(container)
@@ -99,36 +96,36 @@ def test_without_masks_the_footage_tells_gravity_and_what_is_hidden(monkeypatch:
     assert "surface" in container.gravity_from
     fields = signed_distance_fields(cast(TrainingScene, scene), 64, container=container.occlusion)
     assert fields.sample(0, (MIDDLE - [0, 0.8 * RADIUS, 0])[None])[0] < 0
-    assert not in_footage(monkeypatch, found(), BallInABowl(masked=False, transparent=True)).occlusion.hides
+    assert not in_footage(found(), BallInABowl(masked=False, transparent=True)).occlusion.hides
     # What is stated stays, and masks come first.
     tilted = found(tilt=0.1)
-    assert in_footage(monkeypatch, tilted, BallInABowl(masked=False, gravity=DOWN)).gravity is DOWN
-    assert in_footage(monkeypatch, tilted, BallInABowl()).source == "masks"
-    assert in_footage(monkeypatch, tilted, BallInABowl(), masks=False).source == "footage"
+    assert in_footage(tilted, BallInABowl(masked=False, gravity=DOWN)).gravity is DOWN
+    assert in_footage(tilted, BallInABowl()).source == "masks"
+    assert in_footage(tilted, BallInABowl(), masks=False).source == "footage"
 
 
-def test_what_is_not_trusted_in_the_footage_tells_gravity_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    doubtful = in_footage(monkeypatch, found(held=0.5), BallInABowl(masked=False))
+def test_what_is_not_trusted_in_the_footage_tells_gravity_at_most() -> None:
+    doubtful = in_footage(found(held=0.5), BallInABowl(masked=False))
     assert (doubtful.source, doubtful.occlusion) == ("none", None)
     assert doubtful.gravity == pytest.approx(DOWN)
     assert "holds 0.50 of what stands" in str(doubtful)
-    uneven = in_footage(monkeypatch, found(held=0.5, share=0.2), BallInABowl(masked=False))
+    uneven = in_footage(found(held=0.5, share=0.2), BallInABowl(masked=False))
     assert uneven.gravity is None
     # A vessel says by itself how it stands.
-    alone = in_footage(monkeypatch, found(share=0.2, tilt=0.3), BallInABowl(masked=False))
+    alone = in_footage(found(share=0.2, tilt=0.3), BallInABowl(masked=False))
     assert alone.gravity == pytest.approx(DOWN)
     # Glass through which no liquid is seen is none, and says no more.
     held = found(share=0.2)
     assert held.vessel is not None
     glass = replace(held, vessel=replace(held.vessel, seen_through=True))
-    opaque = in_footage(monkeypatch, glass, BallInABowl(masked=False))
+    opaque = in_footage(glass, BallInABowl(masked=False))
     assert (opaque.occlusion, opaque.gravity) == (None, None)
     assert "no liquid shows through walls" in str(opaque)
-    clear = in_footage(monkeypatch, glass, BallInABowl(masked=False, transparent=True))
+    clear = in_footage(glass, BallInABowl(masked=False, transparent=True))
     assert (clear.source, clear.occlusion.hides) == ("footage", False)
     refused = replace(held, vessel=replace(held.vessel, refused="the rim is beyond the images"))
-    assert "the rim is beyond" in str(in_footage(monkeypatch, refused, BallInABowl(masked=False)))
-    nothing = in_footage(monkeypatch, Standing(None, None), BallInABowl(masked=False))
+    assert "the rim is beyond" in str(in_footage(refused, BallInABowl(masked=False)))
+    nothing = in_footage(Standing(None, None), BallInABowl(masked=False))
     assert (nothing.occlusion, nothing.gravity) == (None, None)
     assert "nothing that rises" in str(nothing)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splashbench.container.footage_vessel import Standing
 from splashbench.harness import side_by_side
 from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Budget, Fitted, Run
@@ -21,7 +22,6 @@ from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.fitting import Fit
 from splashbench_methods.splashsplat.appearance.warm_start import Learned
 from splashbench_methods.splashsplat.carriers.subframe import Track
-from splashbench_methods.splashsplat.fields import container
 from splashbench_methods.splashsplat.method import FittedSplashSplat
 
 SMALL = {"hull_cells": 32, "transport_cells": 16, "control_cells": 6, "velocity_steps": 2, "self_calibration": False}
@@ -115,18 +115,31 @@ def test_who_looks_on_changes_nothing(
     np.testing.assert_array_equal(*images)
 
 
-def test_a_draft_does_not_wait_for_a_container_that_the_footage_has_to_show(
+def test_a_draft_does_not_wait_for_all_that_the_footage_tells_of_a_container(
     balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
-    draft, look = course.make_draft, container.standing_about_liquid
+
+    class Search:
+        def __init__(self, scene: TrainingScene, plates: Any) -> None:
+            done.append("search")
+
+        def roughly(self) -> Standing:
+            done.append("roughly")
+            return Standing(None, None)
+
+        def found(self) -> Standing:
+            done.append("found")
+            return Standing(None, None)
+
+    draft = course.make_draft
     monkeypatch.setattr(course, "make_draft", lambda *given: (draft(*given), done.append("draft"))[0])
-    monkeypatch.setattr(container, "standing_about_liquid", lambda *given: (look(*given), done.append("container"))[0])
+    monkeypatch.setattr(course, "StandingSearch", Search)
     monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
     run = Run()
     run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
     fitted(balls, run, iterations=20, draft_cells=32, container=False, container_masks=False)
-    assert done == ["draft", "container"]
+    assert done == ["search", "roughly", "draft", "found"]
 
 
 @pytest.fixture
