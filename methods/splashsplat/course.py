@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splashbench.container.footage_vessel import Standing, StandingSearch
+from splashbench.container.footage_vessel import Standing, standing_about_liquid, standing_roughly
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Decision, Run
 from splashbench.parallel import thread_count
@@ -71,7 +71,7 @@ class Course:
         # Of the process before the fit, which a budget of memory has to know.
         self._loaded = 0 if run.budget.memory_bytes is None else sum(resident_bytes(os.getpid()).values())
         self._known: KnownContainer | None = None
-        self._look_anew()
+        self._plates: Callable[[], Plates] = _plates_of(scene)
         # Of its settings, those that a budget asks for.
         self._smaller_background: dict[str, int] = {}
         # What is shown until there is something better; large.
@@ -96,15 +96,6 @@ class Course:
         with run.stage("draft"):
             return make_draft(self._scene, self._config, run.aside(), known, self._plates, show)
 
-    def _look_anew(self) -> None:
-        """What the footage of the scene tells is looked for once each."""
-        from ..scaffold_gs import clean_plates
-
-        scene = self._scene
-        plates: Callable[[], Plates] = cache(lambda: clean_plates(scene))
-        self._plates = plates
-        self._standing = cache(lambda: StandingSearch(scene, plates()))
-
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
         run = self._run
@@ -115,11 +106,11 @@ class Course:
         if found:
             run.note("self-calibration", "; ".join(found.lines(self._scene.cameras)))
             self._scene, self._known = found.scene(self._scene), None
-            self._look_anew()
+            self._plates = _plates_of(self._scene)
 
     def _rough_container(self) -> KnownContainer:
         """For a draft, which does not wait for what takes the footage longer to tell."""
-        known = self._look_for_container(lambda: self._standing().roughly())
+        known = self._look_for_container(lambda: standing_roughly(self._scene, self._plates()))
         if known.source in ("mesh", "masks"):
             self._known = known
         return known
@@ -127,7 +118,7 @@ class Course:
     def _container(self) -> KnownContainer:
         """Looked for once, for all traces."""
         if self._known is None:
-            self._known = self._look_for_container(lambda: self._standing().found())
+            self._known = self._look_for_container(lambda: standing_about_liquid(self._scene, self._plates()))
         return self._known
 
     def _look_for_container(self, standing: Callable[[], Standing]) -> KnownContainer:
@@ -282,3 +273,10 @@ class Course:
         views = {name: self._scene.cameras[name] for name in self._scene.train}
         frozen = {name: freeze(*background.gaussians(camera), camera) for name, camera in views.items()}
         return self._fine(dict.fromkeys(views, background.far_color), traced, _BEFORE, frozen=frozen)
+
+
+def _plates_of(scene: TrainingScene) -> Callable[[], Plates]:
+    """Makes the clean plates of `scene`, once."""
+    from ..scaffold_gs import clean_plates
+
+    return cache(lambda: clean_plates(scene))

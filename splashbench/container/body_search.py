@@ -107,6 +107,15 @@ def grown(numbers: Floats, share: float) -> Floats:
     return larger
 
 
+def narrowed(numbers: Floats, by: float) -> Floats:
+    """The numbers of the body of which radii are less by so much, scene units, and half of that the height; never by
+    more than half of what they are."""
+    smaller = numbers.copy()
+    smaller[ALL_RADII] -= np.minimum(by, 0.5 * smaller[ALL_RADII])
+    smaller[HEIGHT] -= min(0.5 * by, 0.5 * smaller[HEIGHT])
+    return smaller
+
+
 def bend(numbers: Floats) -> float:
     """How much a profile bends: the sum of squares of its second differences, by the largest radius."""
     radii = numbers[ALL_RADII]

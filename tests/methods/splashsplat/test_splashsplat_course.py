@@ -120,26 +120,18 @@ def test_a_draft_does_not_wait_for_all_that_the_footage_tells_of_a_container(
 ) -> None:
     done: list[str] = []
 
-    class Search:
-        def __init__(self, scene: TrainingScene, plates: Any) -> None:
-            done.append("search")
-
-        def roughly(self) -> Standing:
-            done.append("roughly")
-            return Standing(None, None)
-
-        def found(self) -> Standing:
-            done.append("found")
-            return Standing(None, None)
+    def look(name: str) -> Callable[..., Standing]:
+        return lambda *_: (done.append(name), Standing(None, None))[1]
 
     draft = course.make_draft
     monkeypatch.setattr(course, "make_draft", lambda *given: (draft(*given), done.append("draft"))[0])
-    monkeypatch.setattr(course, "StandingSearch", Search)
+    for name in ("standing_roughly", "standing_about_liquid"):
+        monkeypatch.setattr(course, name, look(name))
     monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
     run = Run()
     run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
     fitted(balls, run, iterations=20, draft_cells=32, container=False, container_masks=False)
-    assert done == ["search", "roughly", "draft", "found"]
+    assert done == ["standing_roughly", "draft", "standing_about_liquid"]
 
 
 @pytest.fixture
