@@ -110,8 +110,15 @@ class Course:
 
     def _rough_container(self) -> KnownContainer:
         """For a draft, which does not wait for what takes the footage longer to tell."""
-        known = self._look_for_container(lambda: standing_roughly(self._scene, self._plates()))
-        if known.source in ("mesh", "masks"):
+        asked = False
+
+        def roughly() -> Standing:
+            nonlocal asked
+            asked = True
+            return standing_roughly(self._scene, self._plates())
+
+        known = self._look_for_container(roughly)
+        if not asked:
             self._known = known
         return known
 

@@ -34,7 +34,8 @@ from splashbench.scene.scene import TrainingScene
 _BY_DEPTH = 0.3
 # In the end height and radii are pushed by so much of the size one by one.
 _PUSHES = (0.08, -0.08)
-# Pixels along the longer side of plates that do for a rough look. What depths show is so many pixels wider than it is.
+# Pixels along the longer side of plates that do for a rough look. What depths show of plain bowls is so many pixels
+# wider than these are; of strongly textured ones it is not, and what is found of them is too narrow.
 _ROUGH_SIDE, _WIDER = 160, 2.0
 
 
@@ -62,8 +63,8 @@ def standing_about_liquid(scene: TrainingScene, plates: Mapping[str, CleanPlate]
 
 
 def standing_roughly(scene: TrainingScene, plates: Mapping[str, CleanPlate]) -> Standing:
-    """The same in a fifth of the time, by depths of small plates alone: a vessel is right to a tenth of its width, and
-    there is none of glass."""
+    """The same in a fifth of the time, by depths of small plates alone, and none of glass. Silhouettes overlap the true
+    ones by .90 to .92 on five made-up bowls that this was chosen on, by .79 and .83 on two painted things."""
     place, views = place_about_liquid(scene, {name: shrunk(plate, _ROUGH_SIDE) for name, plate in plates.items()})
     if place is None:
         return Standing(None, None)

@@ -75,6 +75,7 @@ def test_a_rough_one_is_there_before_edges_are_looked_at(speckled: Path) -> None
     assert np.rad2deg(np.arccos(roughly.support.normal @ UP)) < 1
     assert roughly.vessel is not None
     assert roughly.vessel.trusted
+    # Nothing was chosen on this scene: without what is taken off for plain bowls it would be .85.
     assert min(covers(roughly, bowl(), speckled)) > 0.75
 
 
