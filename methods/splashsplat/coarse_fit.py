@@ -15,6 +15,7 @@ from splashbench.scene.scene import TrainingScene
 
 from .appearance.warm_start import Learned
 from .fields.container import KnownContainer
+from .fields.observations import Sightings
 from .reconstruction import Reconstruction, fit_liquid, trace_liquid
 from .settings import SplashSplatConfig
 
@@ -36,6 +37,7 @@ def fit_coarsely(
     config: SplashSplatConfig,
     run: Run,
     known: KnownContainer | None,
+    before: Sightings,
     behind: dict[str, np.ndarray],
     offer: Callable[[Callable[[], Reconstruction], bool], None] | None,
     span: tuple[float, float],
@@ -43,12 +45,12 @@ def fit_coarsely(
     """What the first iterations by `config` teach, on coarse grids, to be taken out of the list, as it is large. It is
     empty where these grids show nothing that a photograph could teach.
 
-    known: see `observe`. behind: float32 [H, W, 3] of every training view, what lies behind the liquid. offer: see
-    `fit_liquid`. span: the part of `run`'s progress this takes up.
+    known, before: see `observe`. behind: float32 [H, W, 3] of every training view, what lies behind the liquid.
+    offer: see `fit_liquid`. span: the part of `run`'s progress this takes up.
     """
     middle = span[0] + _TRACE * (span[1] - span[0])
     # What the observations say is noted by the fine ones.
-    traced = trace_liquid(scene, config.coarse(), run.aside((span[0], middle)), known)
+    traced = trace_liquid(scene, config.coarse(), run.aside((span[0], middle)), known, before)
     learned: list[Learned] = []
     found = fit_liquid(scene, behind, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)
     if learned and offer is not None:

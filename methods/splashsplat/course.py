@@ -27,7 +27,7 @@ from splashbench.parallel import thread_count
 from splashbench.processes import resident_bytes
 from splashbench.render import Frozen, freeze
 from splashbench.scene.scene import TrainingScene
-from splashbench.selfcalibration import self_calibration
+from splashbench.selfcalibration import hardly_masked, self_calibration
 
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
 from .affordable_memory import within_memory
@@ -35,6 +35,7 @@ from .appearance.warm_start import Learned
 from .coarse_fit import begins_on_coarse_grids, fit_coarsely
 from .draft import State, make_draft
 from .fields.container import KnownContainer, known_container
+from .fields.observations import Sightings
 from .reconstruction import Reconstruction, Traced, fit_liquid, trace_liquid
 from .settings import SplashSplatConfig
 from .transmittance import transmittance
@@ -70,8 +71,12 @@ class Course:
         self._show = show if run.watched else None
         # Of the process before the fit, which a budget of memory has to know.
         self._loaded = 0 if run.budget.memory_bytes is None else sum(resident_bytes(os.getpid()).values())
+        self._masked = not hardly_masked(scene)
         self._known: KnownContainer | None = None
+        # What coarse and fine grids are told by the same masks.
+        self._sightings: Sightings = {}
         self._plates: Callable[[], Plates] = _plates_of(scene)
+        self._transmittance: float | None = None
         # Of its settings, those that a budget asks for.
         self._smaller_background: dict[str, int] = {}
         # What is shown until there is something better; large.
@@ -81,10 +86,14 @@ class Course:
 
     def taken(self) -> State:
         """The whole fit."""
+        if not self._masked:
+            # Without the masks that this finds there is nothing that a draft could be made of.
+            self._calibrate()
         if self._show is not None and self._config.draft_cells > 0:
             self._drafted = self._draft(self._show)
             self._background = self._drafted[1]
-        self._calibrate()
+        if self._masked:
+            self._calibrate()
         if begins_on_coarse_grids(self._scene, self._config, self._run):
             return self._from_coarse_grids()
         self._drafted = None
@@ -94,18 +103,19 @@ class Course:
         run, known = self._run, self._rough_container()
         run.progress(0, "draft")
         with run.stage("draft"):
-            return make_draft(self._scene, self._config, run.aside(), known, self._plates, show)
+            opaque = self._shows_through() < _TRANSPARENT
+            return make_draft(self._scene, self._config, run.aside(), known, self._plates, opaque, show)
 
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
         run = self._run
-        if not self._config.self_calibration or not affords_self_calibration(run):
+        if not self._config.self_calibration or (self._masked and not affords_self_calibration(run)):
             return
         with run.stage("self-calibration"):
             found = self_calibration(self._scene, self._plates, lambda what: run.progress(0, what))
         if found:
             run.note("self-calibration", "; ".join(found.lines(self._scene.cameras)))
-            self._scene, self._known = found.scene(self._scene), None
+            self._scene, self._known, self._transmittance = found.scene(self._scene), None, None
             self._plates = _plates_of(self._scene)
 
     def _rough_container(self) -> KnownContainer:
@@ -134,6 +144,12 @@ class Course:
         with self._run.stage("container"):
             return known_container(self._scene, config.container, config.container_masks, footage)
 
+    def _shows_through(self) -> float:
+        """How much of what is behind the liquid shows through it, asked once."""
+        if self._transmittance is None:
+            self._transmittance = transmittance(self._scene, self._plates())
+        return self._transmittance
+
     def _stand_in(self) -> Backgrounds:
         """What lies behind the liquid of every training view before the background is fitted."""
         from ..scaffold_gs import completed, flat_background
@@ -158,7 +174,7 @@ class Course:
             self._show(lambda: (liquid, made(), occlusion), milestone)
 
     def _trace(self, part: Run) -> Traced:
-        return trace_liquid(self._scene, self._config, part, self._known)
+        return trace_liquid(self._scene, self._config, part, self._known, self._sightings)
 
     def _offer(self, found: Callable[[], Reconstruction], milestone: bool) -> None:
         """Show what was `found`, before the background that there is."""
@@ -174,7 +190,7 @@ class Course:
     def _from_coarse_grids(self) -> State:
         """With coarse grids first."""
         run, behind = self._run, self._stand_in()
-        share = transmittance(self._scene, self._plates())
+        share = self._shows_through()
         transparent = share >= _TRANSPARENT
         run.decide(
             Decision(
@@ -209,7 +225,14 @@ class Course:
         offer = None if self._show is None else self._offer
         with self._run.stage("coarse fit"):
             return fit_coarsely(
-                self._scene, self._config, self._run, container, behind, offer, (start, start + _COARSE)
+                self._scene,
+                self._config,
+                self._run,
+                container,
+                self._sightings,
+                behind,
+                offer,
+                (start, start + _COARSE),
             )
 
     def _fine(
@@ -266,7 +289,7 @@ class Course:
 
         def trace(part: Run) -> Traced:
             def on(config: SplashSplatConfig) -> Traced:
-                return trace_liquid(self._scene, config, part, known)
+                return trace_liquid(self._scene, config, part, known, self._sightings)
 
             first = within_memory(self._scene, self._config, part, self._loaded, on, spent.traced)
             return within_bytes(self._config, part, on, first)

@@ -38,18 +38,20 @@ def make_draft(
     run: Run,
     known: KnownContainer,
     plates: Callable[[], Plates],
+    opaque: bool,
     offer: Callable[[Callable[[], State], bool], None],
 ) -> State:
     """Fit a draft of `scene`; returns it.
 
-    config: that of the fit. run: see `Run.aside`. plates: gives what the training views show without the liquid. offer:
-    is given what makes the draft as it is, and whether there will be no other for a while; at the end, too.
+    config: that of the fit. run: see `Run.aside`. plates: gives what the training views show without the liquid.
+    opaque: see `SplashSplatConfig.draft`. offer: is given what makes the draft as it is, and whether there will be no
+    other for a while; at the end, too.
     """
     from ..scaffold_gs import BackgroundSettings, clean_plates, completed, fit_background, flat_background
 
     first = clean_plates(scene, n_frames=1)
     background = flat_background(first)
-    coarse = config.draft()
+    coarse = config.draft(opaque)
 
     def settled() -> dict[str, np.ndarray]:
         nonlocal background

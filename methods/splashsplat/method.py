@@ -193,10 +193,9 @@ class SplashSplat(GaussianMethod):
     Config = SplashSplatConfig
 
     def supports(self, scene: TrainingScene) -> Support:
-        """Needs liquid masks in two training views."""
-        seeing = [name for name in scene.train if any(scene.mask(name, t).any() for t in range(scene.n_frames))]
-        if len(seeing) < MIN_VIEWS:
-            return Support(False, f"needs liquid masks in {MIN_VIEWS} training views, and has {len(seeing)}")
+        """Needs two training views. Where masks show no liquid, photographs are asked where it is."""
+        if len(scene.train) < MIN_VIEWS:
+            return Support(False, f"needs {MIN_VIEWS} training views, and has {len(scene.train)}")
         return Support(True)
 
     def fit(self, scene: TrainingScene, config: SplashSplatConfig, run: Run) -> FittedSplashSplat:

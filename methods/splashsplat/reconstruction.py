@@ -35,7 +35,7 @@ from .carriers.subframe import Track
 from .carriers.tracking import CarrierTracker, Simulation, Tracking
 from .carriers.visibility import seen_by_any
 from .fields.container import KnownContainer
-from .fields.observations import Observations, observe
+from .fields.observations import Observations, Sightings, observe
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import FlipSolver, FlipTransport, gravity_in_voxels
 from .model import Liquid
@@ -86,10 +86,14 @@ def _clock(run: Run) -> Clock | None:
 
 
 def trace_liquid(
-    scene: TrainingScene, config: SplashSplatConfig, run: Run, known: KnownContainer | None = None
+    scene: TrainingScene,
+    config: SplashSplatConfig,
+    run: Run,
+    known: KnownContainer | None = None,
+    before: Sightings | None = None,
 ) -> Traced:
-    """Observe the liquid of `scene` and follow it; needs no background. known: the container, see `observe`."""
-    observations = observe(scene, config.fields, run, run.progress, known)
+    """Observe the liquid of `scene` and follow it; needs no background. known, before: see `observe`."""
+    observations = observe(scene, config.fields, run, run.progress, known, before)
     if observations.in_transparent_container:
         config = config.in_transparent_container()
         sooner = ", and idle carriers are looked for sooner" if config.idle_early else ""

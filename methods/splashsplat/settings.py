@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 # Of the draft: what a few seconds allow, and the share of them before its background.
 _DRAFT_ITERATIONS = 400
 _DRAFT_PLATES_SHARE = 0.25
+# How far beyond the surface carriers of opaque liquid are born, in voxels.
+_DRAFT_SHELL_OUTSIDE = 0.125
 # And the edge of its hull voxels in pixels, and how few there are at least.
 _DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
 # Hull cells of the coarse grids, at most. Edge of their voxels at the least, in fine ones: in an opaque container, and
@@ -43,7 +45,7 @@ _COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "24"
+VERSION = "25"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -437,10 +439,13 @@ class SplashSplatConfig(MethodConfig):
             }
         )
 
-    def draft(self) -> SplashSplatConfig:
-        """The settings of the draft: coarse carriers of each frame alone, and few iterations."""
+    def draft(self, opaque: bool = False) -> SplashSplatConfig:
+        """The settings of the draft: coarse carriers of each frame alone, and few iterations. opaque: whether nothing
+        is known to show through the liquid."""
         return self.model_copy(
             update={
+                # So coarse a surface is off by a part of a voxel. Carriers beyond it make clear liquid too wide.
+                "shell_outside": max(self.shell_outside, _DRAFT_SHELL_OUTSIDE if opaque else 0.0),
                 "hull_cells": max(16, self.draft_cells),
                 "transport_cells": max(16, self.draft_cells // 2),
                 "voxel_pixels": _DRAFT_PIXELS,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from splashbench.arrays import Floats
 from splashbench.background.clean_plate import shrunk
+from splashbench.container.outline_kernels import strength_along, sum_within
 from splashbench.container.standing import ContainerView
 from splashbench.scene.camera import Camera
 
@@ -74,7 +75,7 @@ class DepthView:
     """camera: of a window. says: `ContainerView.says` in it."""
 
     camera: Camera
-    says: NDArray[np.float32]
+    says: NDArray[np.int8]
 
     @classmethod
     def of(cls, view: ContainerView) -> DepthView:
@@ -89,7 +90,7 @@ class DepthView:
 
     def held(self, rings: Floats) -> float:
         """How many of them the silhouette of `rings` holds, less those that speak against it."""
-        return _held(self.says, silhouette_of(rings, self.camera))
+        return sum_within(self.says, silhouette_of(rings, self.camera))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,23 +123,12 @@ class EdgeView(DepthView):
         """How strong edges are across the outline of the silhouette of `rings`, in the mean, 0 to 1; and `held`
         of it."""
         drawn = silhouette_of(rings, self.camera)
-        held = _held(self.says, drawn)
+        held = sum_within(self.says, drawn)
         contours, _ = cv2.findContours(drawn, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         if not contours:
             return 0.0, held
-        outline = max(contours, key=len)[:, 0]
-        x, y = (np.roll(outline, -_ALONG, axis=0) - np.roll(outline, _ALONG, axis=0)).T.astype(np.float32)
-        length = np.maximum(np.hypot(x, y), 1e-6)
-        columns, rows = outline.T
-        across, down = self.across[rows, columns], self.down[rows, columns]
-        change = np.abs(across * (y / length)[:, None] - down * (x / length)[:, None]).max(axis=1)
-        seen = self.seen[rows, columns]
-        return float((change / (change + 1))[seen].mean()) if seen.any() else 0.0, held
-
-
-def _held(says: NDArray[np.float32], drawn: NDArray[np.uint8]) -> float:
-    """The sum of `says` [H, W] over what is drawn."""
-    return float(cv2.sumElems(cv2.copyTo(says, drawn))[0])
+        outline = np.ascontiguousarray(max(contours, key=len)[:, 0])
+        return strength_along(outline, self.across, self.down, self.seen, _ALONG), held
 
 
 def silhouette_of(rings: Floats, camera: Camera) -> NDArray[np.uint8]:

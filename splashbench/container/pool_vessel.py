@@ -151,7 +151,7 @@ def pool_views(scene: TrainingScene, place: Place, plates: Mapping[str, CleanPla
         return []
     return [
         ContainerView(
-            scene.cameras[name], rests.astype(np.float32) - (~found[name][1]).astype(np.float32), points, plates[name]
+            scene.cameras[name], rests.astype(np.int8) - (~found[name][1]).astype(np.int8), points, plates[name]
         )
         for name, rests in resting.items()
     ]

@@ -70,12 +70,12 @@ class Place:
 class ContainerView:
     """What a view shows of the container.
 
-    camera: of the depths. says: float32 [H, W], 1 where it shows the container, -1 where it shows what lies around it,
+    camera: of the depths. says: int8 [H, W], 1 where it shows the container, -1 where it shows what lies around it,
     0 elsewhere. points: [N, 3], the plan of what shows it. plate: of the same view, in its own size.
     """
 
     camera: Camera
-    says: NDArray[np.float32]
+    says: NDArray[np.int8]
     points: Floats
     plate: CleanPlate
 
@@ -162,9 +162,9 @@ def _nearest_thing(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray((things == chosen) & usable.any())
 
 
-def _speaks(place: Place, depth: DepthMap, plan: Floats, shows: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _speaks(place: Place, depth: DepthMap, plan: Floats, shows: NDArray[np.bool_]) -> NDArray[np.int8]:
     """`ContainerView.says`. shows: bool [H, W], where the view shows the container."""
     flat = plan[..., 2] < _SURELY_FLAT * _RISES * place.distance
     far = np.linalg.norm(plan[..., :2], axis=-1) >= _ABOUT * place.distance
     against = depth.trusted & ~shows & (flat | far)
-    return np.asarray(shows, np.float32) - np.asarray(against, np.float32)
+    return np.asarray(shows, np.int8) - np.asarray(against, np.int8)

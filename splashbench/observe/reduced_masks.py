@@ -45,8 +45,9 @@ def _reduced(camera: Camera, factor: int) -> Camera:
     return replace(camera, width=-(-camera.width // factor), height=-(-camera.height // factor), K=K)
 
 
-def reduced(scene: MaskedScene, cells: int) -> MaskedScene:
-    """`scene`, reduced as far as a hull of `cells` voxels along the liquid's longest side allows.
+def reduction(scene: MaskedScene, cells: int) -> int:
+    """The whole number by which `scene` is reduced as far as a hull of `cells` voxels along the liquid's longest side
+    allows.
 
     The longest side is taken from what the views ever see of the liquid, in the view that sees it smallest.
     """
@@ -60,5 +61,10 @@ def reduced(scene: MaskedScene, cells: int) -> MaskedScene:
             for window in windows[1:]:
                 union = union.joined(window)
             longest.append(max(union.shape))
-    factor = int(min(longest) / cells / PIXELS_PER_VOXEL) if longest else 1
+    return max(1, int(min(longest) / cells / PIXELS_PER_VOXEL)) if longest else 1
+
+
+def reduced(scene: MaskedScene, cells: int) -> MaskedScene:
+    """`scene`, reduced as far as a hull of `cells` voxels along the liquid's longest side allows; see `reduction`."""
+    factor = reduction(scene, cells)
     return ReducedScene(scene, factor) if factor > 1 else scene

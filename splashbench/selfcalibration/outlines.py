@@ -13,7 +13,7 @@ where outlines are longer than what photographs can show: these are blurred or c
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -27,11 +27,13 @@ from splashbench.observe.silhouettes import outline_distance
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
-_Images = NDArray[np.uint8]
-_Masks = NDArray[np.bool_]
+Images = NDArray[np.uint8]
+Masks = NDArray[np.bool_]
 
-# Masks are looked at in at most so many frames of each camera, and with no side longer than this, in pixels.
-_FRAMES, _SIDE = 16, 480
+#: Masks are looked at in at most so many frames of each camera.
+FRAMES = 16
+# And with no side longer than this, in pixels.
+_SIDE = 480
 # Rounds to see whether something is wrong, and to say what is right.
 _ROUNDS, _ROUNDS_MORE = 3, 5
 # Bins of a channel; pixels that every bin has besides, and the width by which bins are smoothed.
@@ -67,7 +69,7 @@ class PackedMasks:
     bits: Mapping[int, bytes]
 
     @classmethod
-    def of(cls, shape: tuple[int, int], masks: Iterable[tuple[int, _Masks]]) -> PackedMasks:
+    def of(cls, shape: tuple[int, int], masks: Iterable[tuple[int, Masks]]) -> PackedMasks:
         return cls(shape, {t: np.packbits(mask).tobytes() for t, mask in masks})
 
     @property
@@ -78,7 +80,7 @@ class PackedMasks:
     def __contains__(self, t: int) -> bool:
         return t in self.bits
 
-    def __getitem__(self, t: int) -> _Masks:
+    def __getitem__(self, t: int) -> Masks:
         flat = np.unpackbits(np.frombuffer(self.bits[t], np.uint8), count=self.shape[0] * self.shape[1])
         return flat.reshape(self.shape).astype(bool)
 
@@ -87,17 +89,20 @@ class PackedMasks:
 class Outlines:
     """Of one camera: masks as photographs show them, where the told ones are wrong.
 
-    beyond: how far the told masks reach beyond these, in pixels, in the middle; below 0 they end inside.
+    beyond: how far the told masks reach beyond these, in pixels, in the middle; below 0 they end inside; None where
+    there were hardly any.
     """
 
     masks: PackedMasks
     n_frames: int
-    beyond: float
+    beyond: float | None
 
     @property
     def line(self) -> str:
         """What is wrong, in words."""
         wrong = sorted(self.masks.bits)
+        if self.beyond is None:
+            return "masks show next to no liquid; it is taken from what changes in its photographs"
         if len(wrong) < self.n_frames:
             some = ", ".join(map(str, wrong[:_NAMED])) + (" ..." if len(wrong) > _NAMED else "")
             which = f"{len(wrong)} of {self.n_frames} masks are not what its photographs show (timesteps {some})"
@@ -111,62 +116,84 @@ class Outlines:
 
 
 @dataclass(frozen=True)
-class _Sample:
+class Sample:
     """Some frames of one camera, small: images [F, h, w, 3], masks [F, h, w] as told. frames: their timesteps."""
 
     frames: tuple[int, ...]
-    images: _Images
-    masks: _Masks
+    images: Images
+    masks: Masks
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class Evidence:
     """Log likelihood ratios of bins, float32 [bins^3]: of differences from the plate, and of colours."""
 
     difference: NDArray[np.float32]
     color: NDArray[np.float32]
 
-    def mask(self, image: _Images, plate: _Images, free: _Masks, told: _Masks) -> _Masks:
+    def each(self, image: Images, plate: Images, free: Masks) -> NDArray[np.float32]:
+        """How much each pixel of `image` [H, W, 3] speaks for liquid, in nats: its colour, and where some frame is
+        `free` of liquid, so that there is a plate, its difference from this."""
+        color = self.color[_color_bins(image)]
+        return np.where(free, self.difference[_difference_bins(image, plate)] + color, color)
+
+    def mask(self, image: Images, plate: Images, free: Masks, told: Masks) -> Masks:
         """What `image` [H, W, 3] says is liquid. Where no frame is `free` of it there is no plate, and
         the colour says so where it is sure, elsewhere the mask that was told."""
-        color = self.color[_color_bins(image)]
-        each = np.where(free, self.difference[_difference_bins(image, plate)] + color, color)
+        each = self.each(image, plate, free)
         smooth = cv2.GaussianBlur(each, (0, 0), max(_LEAST_BLUR, _BLUR * max(image.shape[:2])))
         return np.where(free | (np.abs(smooth) > _SURE), smooth > _FROM, told)
 
 
 @dataclass(frozen=True)
-class _Answer:
+class Answer:
     """What photographs say: masks [F, h, w], and by what they say it; None where they say nothing."""
 
-    masks: _Masks
-    evidence: _Evidence | None
+    masks: Masks
+    evidence: Evidence | None
+
+    def plate(self, sample: Sample) -> tuple[Images, Masks]:
+        """The clean plate of `sample` by its masks, uint8 [h, w, 3], and where there is one, bool [h, w]."""
+        outside = _far_outside(np.stack([outline_distance(mask) for mask in self.masks]), _FAR_LATER)
+        return masked_median(sample.images, outside), np.asarray(outside.any(axis=0))
 
 
-def outlines(scene: TrainingScene, names: Sequence[str]) -> dict[str, Outlines]:
-    """The masks of the training cameras `names` of `scene` that are not what the photographs show; none where all are,
-    or where photographs do not tell."""
-    samples = {name: _sample(scene, name) for name in names}
+@dataclass(frozen=True)
+class Examined:
+    """Of some cameras: outlines of those whose masks are not what the photographs show, and the names of those whose
+    masks seem wrong, while what photographs say instead is not to be trusted."""
+
+    outlines: Mapping[str, Outlines]
+    untrusted: tuple[str, ...]
+
+
+def examined(scene: TrainingScene, names: Sequence[str]) -> Examined:
+    """The masks of the training cameras `names` of `scene`, held against its photographs."""
+    samples = {name: sampled(scene, name) for name in names}
     if not samples:
-        return {}
+        return Examined({}, ())
     wrong = {}
     for name, sample in samples.items():
-        said = _asked(sample, sample.masks, _ROUNDS).masks
-        wrong[name] = np.array([_wrong(*pair) for pair in zip(sample.masks, said)])
+        shown = asked(sample, sample.masks, _ROUNDS).masks
+        wrong[name] = np.array([_wrong(*pair) for pair in zip(sample.masks, shown)])
     middle = float(np.median([np.median(of_camera) for of_camera in wrong.values()]))
     found: dict[str, Outlines] = {}
+    untrusted = []
     for name, sample in samples.items():
         if _suspicious(wrong[name], middle).any():
-            answer = _asked(sample, sample.masks, _ROUNDS_MORE)
+            answer = asked(sample, sample.masks, _ROUNDS_MORE)
             if answer.evidence is not None and _trusted(sample, answer.masks):
                 replaced = _replaced(scene, name, sample, answer, middle)
                 found |= {name: replaced} if replaced else {}
-    return found
+            else:
+                untrusted.append(name)
+    return Examined(found, tuple(untrusted))
 
 
-def _sample(scene: TrainingScene, name: str) -> _Sample:
+def sampled(scene: TrainingScene, name: str) -> Sample:
+    """Some frames of camera `name`."""
     camera = scene.cameras[name]
-    chosen = spread_frames(scene.n_frames, _FRAMES).tolist()
+    chosen = spread_frames(scene.n_frames, FRAMES).tolist()
     scale = min(1.0, _SIDE / max(camera.width, camera.height))
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     images = np.empty((len(chosen), size[1], size[0], 3), np.uint8)
@@ -176,44 +203,49 @@ def _sample(scene: TrainingScene, name: str) -> _Sample:
         image, mask = scene.image(name, t), scene.mask(name, t)
         images[i] = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         masks[i] = mask if scale == 1.0 else _resized(mask, size)
-    return _Sample(tuple(chosen), images, masks)
+    return Sample(tuple(chosen), images, masks)
 
 
-def _resized(mask: _Masks, size: tuple[int, int]) -> _Masks:
+def _resized(mask: Masks, size: tuple[int, int]) -> Masks:
     """`mask` with `size` (columns, rows)."""
     smaller = size[0] < mask.shape[1]
     share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     return np.asarray(share >= 0.5)
 
 
-def _asked(sample: _Sample, start: _Masks, rounds: int) -> _Answer:
-    """What the photographs of `sample` say, asked with the masks `start` [F, h, w] in the first round."""
-    longest = max(sample.images.shape[1:3])
+def asked(sample: Sample, start: Masks, rounds: int, may_fail: bool = True) -> Answer:
+    """What the photographs of `sample` say, asked with the masks `start` [F, h, w] in the first round. may_fail: an
+    empty one of these may be one that failed."""
     colors = _color_bins(sample.images)
     masks, evidence = start, None
     for number in range(rounds):
         depth = np.stack([outline_distance(mask) for mask in masks])
-        pixels, share = _FAR if number == 0 else _FAR_LATER
-        outside = depth < -max(pixels, share * longest)
+        outside = _far_outside(depth, _FAR if number == 0 else _FAR_LATER)
         shown = masks.any(axis=(1, 2), keepdims=True)
-        if number == 0 and shown.mean() > 0.5:
-            # An empty mask may be one that failed: what it would add to the plate is liquid then.
+        if number == 0 and may_fail and shown.mean() > 0.5:
+            # What a mask that failed would add to the plate is liquid.
             outside &= shown
         inside = depth > (_deep(depth) if number == 0 else _DEEP_LATER)
         if not inside.any() and masks.any():
             inside = depth >= np.median(depth[masks])
-        free = outside.any(axis=0)
+        free: Masks = np.asarray(outside.any(axis=0))
         plate = masked_median(sample.images, outside)
         inside &= free
         if not inside.any() or not outside.any():
             break
         differences = _difference_bins(sample.images, plate)
-        evidence = _Evidence(
+        evidence = Evidence(
             _likelihood_ratio(differences[inside], differences[outside]),
             _likelihood_ratio(colors[inside], colors[outside]),
         )
         masks = np.stack([evidence.mask(image, plate, free, mask) for image, mask in zip(sample.images, masks)])
-    return _Answer(masks, evidence)
+    return Answer(masks, evidence)
+
+
+def _far_outside(depth: NDArray[np.float32], far: tuple[float, float]) -> Masks:
+    """The pixels of `depth` [..., h, w] inside outlines that are `far` outside: in pixels, or as a share of the longer
+    side where that is more."""
+    return np.asarray(depth < -max(far[0], far[1] * max(depth.shape[-2:])))
 
 
 def _deep(depth: NDArray[np.float32]) -> float:
@@ -222,7 +254,7 @@ def _deep(depth: NDArray[np.float32]) -> float:
     return max(_DEEP, float(np.quantile(inside, _DEEPEST))) if len(inside) else _DEEP
 
 
-def _trusted(sample: _Sample, answer: _Masks) -> bool:
+def _trusted(sample: Sample, answer: Masks) -> bool:
     """Whether photographs say much the same as `answer` when they are asked with less or with more than the masks, and
     show as much of outlines as these."""
     if _outline(answer) < _AS_SHARP * _outline(sample.masks):
@@ -232,40 +264,40 @@ def _trusted(sample: _Sample, answer: _Masks) -> bool:
     for beyond in _STARTS:
         start = depth > -beyond
         before = _in_common(sample.masks, start)
-        after = _in_common(answer, _asked(sample, start, _ROUNDS_MORE).masks)
+        after = _in_common(answer, asked(sample, start, _ROUNDS_MORE).masks)
         met.append((after - before) / max(1 - before, 1e-6))
     return max(met) >= _MET
 
 
-def _outline(masks: _Masks) -> float:
+def _outline(masks: Masks) -> float:
     """Pixels along the outlines of `masks` [F, h, w], by their area."""
     along = sum(int((np.abs(outline_distance(mask)) < 1).sum()) for mask in masks)
     return along / max(1, int(masks.sum()))
 
 
-def _in_common(one: _Masks, other: _Masks) -> float:
+def _in_common(one: Masks, other: Masks) -> float:
     """Intersection over union of all frames together."""
     return float((one & other).sum() / max(1, (one | other).sum()))
 
 
-def _wrong(told: _Masks, said: _Masks) -> float:
+def _wrong(told: Masks, said: Masks) -> float:
     """The pixels of `told` [h, w] that are wrong by `said`, by the larger area of both; outlines that are the same but
     for `_SAME` are right."""
     return float(_apart(told, said).sum() / max(told.sum(), said.sum(), _LEAST_AREA * told.size))
 
 
-def _reach(mask: _Masks) -> float:
+def _reach(mask: Masks) -> float:
     """Pixels within which outlines are the same."""
     return _SAME * max(1.0, max(mask.shape) / 240)
 
 
-def _apart(told: _Masks, said: _Masks) -> _Masks:
+def _apart(told: Masks, said: Masks) -> Masks:
     """The pixels [h, w] of which one says that they are liquid, farther from the outline of `told` than `_SAME`."""
     depth, reach = outline_distance(told), _reach(told)
     return np.asarray((said & (depth < -reach)) | (~said & (depth > reach)))
 
 
-def _mended(told: _Masks, said: _Masks) -> _Masks:
+def _mended(told: Masks, said: Masks) -> Masks:
     """`told` with what `said` says where they are apart, and beside that; the rest of its outline stays."""
     radius = int(np.ceil(_reach(told))) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
@@ -282,24 +314,28 @@ def _suspicious(wrong: NDArray[np.float64], middle: float) -> NDArray[np.bool_]:
     return np.asarray(wrong > _ONE_WRONG)
 
 
-def _replaced(scene: TrainingScene, name: str, sample: _Sample, answer: _Answer, middle: float) -> Outlines | None:
-    """The masks of camera `name` in full size, by the evidence of some small frames; None where none is wrong."""
+def said(scene: TrainingScene, name: str, sample: Sample, answer: Answer) -> Iterator[Masks]:
+    """The masks of camera `name` in full size and of all timesteps, by the evidence of some small frames."""
     assert answer.evidence is not None
     camera = scene.cameras[name]
     size = (camera.width, camera.height)
     same_size = sample.masks.shape[1:] == (camera.height, camera.width)
     known = answer.masks if same_size else np.stack([_resized(mask, size) for mask in answer.masks])
-    far = max(_FAR_LATER[0], _FAR_LATER[1] * max(size))
-    outside = np.stack([outline_distance(mask) < -far for mask in known])
-    free: _Masks = np.asarray(outside.any(axis=0))
+    outside = np.stack([_far_outside(outline_distance(mask), _FAR_LATER) for mask in known])
+    free: Masks = np.asarray(outside.any(axis=0))
     images = sample.images if same_size else np.stack([scene.image(name, t) for t in sample.frames])
     plate = masked_median(images, outside)
     del images, outside
-    right: dict[int, _Masks] = {}
-    wrong, gained, length = np.empty(scene.n_frames), np.empty(scene.n_frames), np.empty(scene.n_frames)
     for t in range(scene.n_frames):
-        told = scene.mask(name, t)
-        right[t] = answer.evidence.mask(scene.image(name, t), plate, free, told)
+        yield answer.evidence.mask(scene.image(name, t), plate, free, scene.mask(name, t))
+
+
+def _replaced(scene: TrainingScene, name: str, sample: Sample, answer: Answer, middle: float) -> Outlines | None:
+    """The masks of camera `name` that are wrong, as photographs show them; None where none is."""
+    right: dict[int, Masks] = {}
+    wrong, gained, length = np.empty(scene.n_frames), np.empty(scene.n_frames), np.empty(scene.n_frames)
+    for t, mask in enumerate(said(scene, name, sample, answer)):
+        told, right[t] = scene.mask(name, t), mask
         wrong[t] = _wrong(told, right[t])
         gained[t] = float(told.sum()) - float(right[t].sum())
         length[t] = max(1.0, (np.abs(outline_distance(right[t])) < 1).sum() / 2)
@@ -320,13 +356,13 @@ def _bins_of_differences() -> NDArray[np.uint16]:
     return np.minimum((0.5 + 0.5 * np.sign(share) * np.sqrt(np.abs(share))) * _BINS, _BINS - 1).astype(np.uint16)
 
 
-def _color_bins(images: _Images) -> NDArray[np.uint16]:
+def _color_bins(images: Images) -> NDArray[np.uint16]:
     """Of uint8 [..., 3] the number of the bin, [...]."""
     parts = images // np.uint8(256 // _BINS)
     return _numbered(parts.astype(np.uint16))
 
 
-def _difference_bins(images: _Images, plate: _Images) -> NDArray[np.uint16]:
+def _difference_bins(images: Images, plate: Images) -> NDArray[np.uint16]:
     """Of uint8 [..., H, W, 3] less `plate` the number of the bin, [..., H, W]."""
     return _numbered(_bins_of_differences()[images.astype(np.int16) - plate + 255])
 

@@ -19,8 +19,9 @@ from .cameras import FittedCameras, corrections, fit_cameras
 from .clocks import Offset, clock_offsets, droplets_of
 from .exposure import Response, responses
 from .features import find_tracks
-from .outlines import Outlines, outlines
+from .outlines import Outlines, examined
 from .stance import Knock, find_knock
+from .unmasked import hardly_masked, outlines_by_change
 
 Plates = Mapping[str, CleanPlate]
 _Values = TypeVar("_Values", np.uint8, np.bool_)
@@ -197,12 +198,18 @@ def self_calibration(
     if len(scene.train) < 2:
         return SelfCalibration()
     step = float(np.median(np.diff(scene.times))) if scene.n_frames > 1 else 1.0
+    found = SelfCalibration(seconds_per_step=step)
+    if hardly_masked(scene):
+        # First of all: whatever else is looked for leaves out the liquid.
+        told("looking for liquid that no mask shows")
+        found = replace(found, outlines=outlines_by_change(scene, scene.train))
     told("looking for cameras that moved")
-    knocks = {name: knock for name in scene.train if (knock := find_knock(scene, name)) is not None}
-    found = SelfCalibration(seconds_per_step=step, knocks=knocks)
+    masked = found.scene(scene)
+    knocks = {name: knock for name in scene.train if (knock := find_knock(masked, name)) is not None}
+    found = replace(found, knocks=knocks)
     told("comparing what cameras show in common")
     steady = found.scene(scene)
-    shown = plates() if plates is not None and not knocks else make_clean_plates(steady)
+    shown = plates() if plates is not None and steady is scene else make_clean_plates(steady)
     shown = {name: plate.without_beside() for name, plate in shown.items()}
     tracks = find_tracks(shown, scene.cameras)
     found = replace(found, cameras=fit_cameras(tracks, scene.cameras))
@@ -211,8 +218,18 @@ def self_calibration(
     told("comparing masks with photographs")
     # Photographs that are moved or straightened are blurred by that, and droplets of few pixels look other than masks.
     bent = found.cameras is not None and found.cameras.distortion != 0
-    sharp = [] if bent else [name for name in scene.train if name not in knocks]
-    found = replace(found, outlines=outlines(found.scene(scene), sharp))
+    sharp = [] if bent else [name for name in scene.train if name not in {*knocks, *found.outlines}]
+    by_change = found.outlines
+    if by_change and (bent or knocks):
+        # As photographs are now.
+        by_change = outlines_by_change(replace(found, outlines={}).scene(scene), list(by_change))
+    right = replace(found, outlines=by_change).scene(scene)
+    held = examined(right, sharp)
+    if 2 * len({*by_change, *held.outlines, *held.untrusted}) >= len(scene.train):
+        # Of masks that show but the core of the liquid it is not told by these what they lack.
+        left = [name for name in sharp if name not in held.outlines]
+        by_change = {**by_change, **outlines_by_change(right, left)}
+    found = replace(found, outlines={**by_change, **held.outlines})
     told("comparing clocks")
     right = found.scene(scene)
     own_times = any(not np.array_equal(times, scene.times) for times in scene.camera_times.values())

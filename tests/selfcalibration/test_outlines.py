@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splashbench.scene import Camera
-from splashbench.selfcalibration.outlines import Outlines, PackedMasks, outlines
+from splashbench.selfcalibration.outlines import Outlines, PackedMasks, examined
 
 from .conftest import NAMES, photograph
 
@@ -86,7 +86,7 @@ def some_empty(name: str, t: int, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return mask & (name != "2" or t % 5 > 0)
 
 
-def agreement(scene: Any, found: dict[str, Outlines]) -> tuple[float, float]:
+def agreement(scene: Any, found: Mapping[str, Outlines]) -> tuple[float, float]:
     """IoU with the truth of the masks as told, and with those that were found in their places."""
     both = np.zeros((2, 2))
     for name in scene.train:
@@ -99,13 +99,13 @@ def agreement(scene: Any, found: dict[str, Outlines]) -> tuple[float, float]:
 
 
 def test_right_masks_stay(cameras: dict[str, Camera]) -> None:
-    assert outlines(footage(cameras), NAMES) == {}
+    assert examined(footage(cameras), NAMES).outlines == {}
 
 
 @pytest.mark.parametrize(("masks", "beyond"), [(eroded, -2), (grown, 4)], ids=["eroded", "grown"])
 def test_masks_that_end_elsewhere_are_replaced(cameras: dict[str, Camera], masks: Masks, beyond: float) -> None:
     scene = footage(cameras, masks)
-    found = outlines(scene, NAMES)
+    found = examined(scene, NAMES).outlines
     assert found.keys() == set(NAMES)
     before, after = agreement(scene, found)
     assert before < 0.6
@@ -119,7 +119,7 @@ def test_masks_that_end_elsewhere_are_replaced(cameras: dict[str, Camera], masks
 
 def test_single_masks_that_show_something_else_are_replaced(cameras: dict[str, Camera]) -> None:
     scene = footage(cameras, one_mirrored)
-    found = outlines(scene, NAMES)
+    found = examined(scene, NAMES).outlines
     assert found.keys() == {"3"}
     assert sorted(found["3"].masks.bits) == [5, 6, 7, 8, 9]
     assert found["3"].line == (
@@ -130,14 +130,14 @@ def test_single_masks_that_show_something_else_are_replaced(cameras: dict[str, C
 
 
 def test_empty_masks_of_frames_with_liquid_are_replaced(cameras: dict[str, Camera]) -> None:
-    found = outlines(footage(cameras, some_empty), NAMES)
+    found = examined(footage(cameras, some_empty), NAMES).outlines
     assert found.keys() == {"2"}
     assert sorted(found["2"].masks.bits) == [0, 5, 10, 15]
 
 
 def test_cameras_that_are_not_named_stay(cameras: dict[str, Camera]) -> None:
-    assert outlines(footage(cameras, eroded), ("1", "4")).keys() == {"1", "4"}
-    assert outlines(footage(cameras, eroded), ()) == {}
+    assert examined(footage(cameras, eroded), ("1", "4")).outlines.keys() == {"1", "4"}
+    assert examined(footage(cameras, eroded), ()).outlines == {}
 
 
 def test_where_photographs_show_no_liquid_masks_stay(cameras: dict[str, Camera]) -> None:
@@ -146,24 +146,24 @@ def test_where_photographs_show_no_liquid_masks_stay(cameras: dict[str, Camera])
     for masks in (eroded, grown, one_mirrored):
         scene = footage(cameras, masks)
         scene.image = lambda name, t: still[name]
-        assert outlines(scene, NAMES) == {}
+        assert examined(scene, NAMES).outlines == {}
 
 
 def test_photographs_that_are_less_sharp_than_masks_have_no_say(cameras: dict[str, Camera]) -> None:
-    assert outlines(footage(cameras, liquid=spray), NAMES) == {}
-    assert outlines(footage(cameras, liquid=spray, blur=2.5), NAMES) == {}
+    assert examined(footage(cameras, liquid=spray), NAMES).outlines == {}
+    assert examined(footage(cameras, liquid=spray, blur=2.5), NAMES).outlines == {}
 
 
 @pytest.mark.parametrize("fill", [False, True], ids=["empty", "full"])
 def test_masks_that_are_all_alike_do_no_harm(cameras: dict[str, Camera], fill: bool) -> None:
     scene = footage(cameras, lambda name, t, mask: np.full_like(mask, fill))
-    assert outlines(scene, NAMES) == {}
+    assert examined(scene, NAMES).outlines == {}
 
 
 def test_a_single_frame_does_no_harm(cameras: dict[str, Camera]) -> None:
     scene = footage(cameras)
     scene.n_frames = 1
-    assert outlines(scene, NAMES) == {}
+    assert examined(scene, NAMES).outlines == {}
 
 
 def test_large_photographs_are_looked_at_small_and_their_masks_are_whole(cameras: dict[str, Camera]) -> None:
@@ -178,7 +178,7 @@ def test_large_photographs_are_looked_at_small_and_their_masks_are_whole(cameras
         image=lambda n, t: cv2.resize(small.image(n, t), (720, 480), interpolation=cv2.INTER_CUBIC),
         mask=lambda n, t: small.mask(n, t).repeat(3, 0).repeat(3, 1),
     )
-    found = outlines(scene, ("1",))
+    found = examined(scene, ("1",)).outlines
     assert found.keys() == {"1"}
     assert found["1"].masks.shape == (480, 720)
     assert found["1"].beyond == pytest.approx(12, abs=3)

@@ -24,7 +24,7 @@ from splashbench.observe.grid import Bounds
 from splashbench.observe.kernels import resample
 from splashbench.observe.observable import Observable, observable
 from splashbench.observe.occlusion import ContainerOcclusion, focal_length
-from splashbench.observe.reduced_masks import reduced
+from splashbench.observe.reduced_masks import ReducedScene, reduction
 from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.scene import TrainingScene
@@ -33,7 +33,7 @@ from .container import KnownContainer, known_container
 from .gravity_cues import GravityCues, gravity_cues
 from .occlusion import LiquidOcclusion
 from .repeats import repeated_frames
-from .rim import rim_of
+from .rim import Rim, rim_of
 
 Report = Callable[[float, str], None]
 
@@ -165,39 +165,49 @@ def _standing(scene: TrainingScene) -> Standing:
     return standing_about_liquid(scene, make_clean_plates(scene))
 
 
+@dataclass(frozen=True)
+class Sighting:
+    """What the masks say whatever the grids. silhouettes, container: see `Observations`. rim: of the container, where
+    it was looked for. bounds: the padded box around all liquid."""
+
+    silhouettes: Silhouettes
+    container: ContainerOcclusion | None
+    rim: Rim | None
+    bounds: Bounds
+
+
+#: Sightings of one scene with one known container, by what they depend on: for those who trace it on several grids.
+Sightings = dict[tuple[Any, ...], Sighting]
+
+
 def observe(
-    scene: TrainingScene, settings: FieldSettings, run: Run, report: Report, known: KnownContainer | None = None
+    scene: TrainingScene,
+    settings: FieldSettings,
+    run: Run,
+    report: Report,
+    known: KnownContainer | None = None,
+    before: Sightings | None = None,
 ) -> Observations:
-    """Look at the masks of all frames of `scene`. known: its container, where it was looked for already.
+    """Look at the masks of all frames of `scene`. known: its container, where it was looked for already. before: what
+    was sighted already, of the same scene and container; to which comes what is sighted now.
 
     Raises SplashbenchError when the masks have no common hull.
     """
-    report(0.0, "reading masks")
-    with run.stage("signed distance"):
-        observed = reduced(scene, settings.hull_cells) if settings.signed_distance == "silhouette" else scene
-        silhouettes = Silhouettes(
-            observed,
-            interpolate_times=None if settings.camera_times else False,
-            replace_empty=settings.replace_empty_masks,
-        )
-        if known is None:
-            footage = partial(_standing, scene) if settings.container_footage else None
+    if known is None:
+        footage = partial(_standing, scene) if settings.container_footage else None
+        with run.stage("signed distance"):
             known = known_container(scene, settings.container, settings.container_masks, footage)
-        container, gravity = known.occlusion, known.gravity
+    gravity = known.gravity
     run.note("container", str(known))
     if gravity is not None:
         run.note(
             "gravity",
             "of the scene" if scene.gravity is not None else f"{known.gravity_from}, {np.round(gravity, 4).tolist()}",
         )
-    rim = None
-    if container is not None and container.hides and settings.cut_at_rim:
-        report(0.0, "looking where the container's rim ends the liquid")
-        with run.stage("rim"):
-            rim = rim_of(known, scene, silhouettes.failed_masks)
+    sighting = _sighting(scene, settings, run, report, known, {} if before is None else before)
+    silhouettes, container, rim, bounds = sighting.silhouettes, sighting.container, sighting.rim, sighting.bounds
+    if rim is not None:
         run.note("rim", str(rim))
-        container = container.with_mesh(rim.mesh)
-    bounds = _bounds(scene, silhouettes, container, settings, run, report)
     seen_through = container is not None and not container.hides
     voxel_pixels = settings.clear_voxel_pixels if seen_through else settings.voxel_pixels
     if settings.observable:
@@ -236,6 +246,41 @@ def observe(
             "repeated frames", f"{int(repeated.sum())} of {len(repeated)} timesteps show what the one before shows"
         )
     return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues, repeated)
+
+
+def _sighting(
+    scene: TrainingScene,
+    settings: FieldSettings,
+    run: Run,
+    report: Report,
+    known: KnownContainer,
+    before: Sightings,
+) -> Sighting:
+    """That of `scene` by `settings`, from `before` where it is there."""
+    report(0.0, "reading masks")
+    with run.stage("signed distance"):
+        factor = reduction(scene, settings.hull_cells) if settings.signed_distance == "silhouette" else 1
+    key = (
+        factor, settings.cut_at_rim, settings.detect_failed_masks, settings.replace_empty_masks,
+        settings.camera_times, settings.tight_bounds,
+    )  # fmt: skip
+    if key in before:
+        return before[key]
+    with run.stage("signed distance"):
+        silhouettes = Silhouettes(
+            ReducedScene(scene, factor) if factor > 1 else scene,
+            interpolate_times=None if settings.camera_times else False,
+            replace_empty=settings.replace_empty_masks,
+        )
+    container, rim = known.occlusion, None
+    if container is not None and container.hides and settings.cut_at_rim:
+        report(0.0, "looking where the container's rim ends the liquid")
+        with run.stage("rim"):
+            rim = rim_of(known, scene, silhouettes.failed_masks)
+        container = container.with_mesh(rim.mesh)
+    bounds = _bounds(scene, silhouettes, container, settings, run, report)
+    found = before[key] = Sighting(silhouettes, container, rim, bounds)
+    return found
 
 
 def _grid_decision(found: Observable, wanted: float, metres: float | None) -> Decision:

@@ -1,0 +1,91 @@
+"""Where liquid is where hardly any mask says so: it is what changes in the photographs.
+
+A pixel that differs from the photograph that the recording begins with, or from the median one, may be liquid. Both
+are asked as masks are (outlines.py). Of the answers the one is taken that is most sure of what is beside the liquid:
+where the first photograph shows liquid already, or the median one does, the place that it leaves is in doubt.
+
+What else moves is taken for liquid, too: a hand, a shadow, whatever the container mirrors. That is why masks that there
+are go before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splashbench.observe.silhouettes import outline_distance
+from splashbench.scene.frames import spread_frames
+from splashbench.scene.scene import TrainingScene
+
+from .outlines import FRAMES, Answer, Masks, Outlines, PackedMasks, Sample, asked, said, sampled
+
+# Masks of less than this share of the image, in the mean, show next to nothing. What changes is no liquid where it is
+# less than that, or more than the other.
+_HARDLY, _MOST = 0.0005, 0.4
+# What there is of masks has to be within what is found by this share, and so much smaller.
+_WITHIN, _SMALLER = 0.8, 4.0
+# A change is so many levels of 255 at least, and so many times the usual difference. It is smoothed by this share of
+# the longer side, and by so many pixels at least.
+_LEVELS, _TIMES, _BLUR, _LEAST_BLUR = 10.0, 6.0, 0.002, 0.6
+# Rounds of questions, and how far beside the liquid answers are compared, as a share of the longer side.
+_ROUNDS, _BESIDE = 8, 0.05
+
+
+def hardly_masked(scene: TrainingScene) -> bool:
+    """Whether the masks of at least half of the training cameras of `scene` show next to no liquid. Where they are
+    fewer, the others tell where it is."""
+    frames = spread_frames(scene.n_frames, FRAMES)
+    hardly = [np.mean([scene.mask(name, int(t)).mean() for t in frames]) < _HARDLY for name in scene.train]
+    return bool(2 * sum(hardly) >= len(hardly))
+
+
+def outlines_by_change(scene: TrainingScene, names: Sequence[str]) -> dict[str, Outlines]:
+    """Masks as photographs show them, of the training cameras of `names` whose own show next to nothing of it; without
+    those whose photographs show no liquid either."""
+    found = {}
+    for name in names:
+        sample = sampled(scene, name)
+        answer = _surest(sample)
+        if answer is not None and _plausible(sample.masks, answer.masks):
+            masks = PackedMasks.of(scene.mask(name, 0).shape, enumerate(said(scene, name, sample, answer)))
+            found[name] = Outlines(masks, scene.n_frames, None)
+    return found
+
+
+def _surest(sample: Sample) -> Answer | None:
+    """The answer that is most sure of what is beside the liquid; None where photographs say nothing."""
+    first, median = sample.images[0], np.median(sample.images, axis=0)
+    answers = [asked(sample, _changed(sample, plate), _ROUNDS, may_fail=False) for plate in (first, median)]
+    told = [answer for answer in answers if answer.evidence is not None and answer.masks.any()]
+    return min(told, key=lambda answer: _doubt(sample, answer), default=None)
+
+
+def _changed(sample: Sample, plate: NDArray[np.generic]) -> Masks:
+    """Where the photographs of `sample` differ from `plate` [h, w, 3], bool [F, h, w]."""
+    behind = plate.astype(np.float32)
+    blur = max(_LEAST_BLUR, _BLUR * max(plate.shape[:2]))
+    difference = np.stack(
+        [cv2.GaussianBlur(np.abs(image - behind).max(axis=2), (0, 0), blur) for image in sample.images]
+    )
+    return np.asarray(difference > max(_LEVELS, _TIMES * float(np.median(difference))))
+
+
+def _doubt(sample: Sample, answer: Answer) -> float:
+    """What speaks for liquid just beside what `answer` takes for it, in nats, in the mean."""
+    assert answer.evidence is not None
+    reach = _BESIDE * max(answer.masks.shape[1:])
+    depth = np.stack([outline_distance(mask) for mask in answer.masks])
+    plate, free = answer.plate(sample)
+    speaks = np.stack([answer.evidence.each(image, plate, free) for image in sample.images])
+    beside = (depth < 0) & (depth > -reach)
+    return float(speaks[beside].mean()) if beside.any() else 0.0
+
+
+def _plausible(told: Masks, found: Masks) -> bool:
+    """Whether what was `found` is as much as a liquid may be, and holds what there is of masks."""
+    if not _HARDLY <= found.mean() <= _MOST or found.sum() < _SMALLER * told.sum():
+        return False
+    return bool((told & found).sum() >= _WITHIN * told.sum())

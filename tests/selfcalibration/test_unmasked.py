@@ -1,0 +1,96 @@
+"""Liquid that no mask shows, found by what changes in photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splashbench.scene import Camera
+from splashbench.selfcalibration import hardly_masked
+from splashbench.selfcalibration.unmasked import outlines_by_change
+
+from .conftest import NAMES
+from .test_outlines import agreement, eroded, footage, splash
+
+Mask = NDArray[np.bool_]
+
+
+def none(name: str, t: int, mask: Mask) -> Mask:
+    return np.zeros_like(mask)
+
+
+def specks(name: str, t: int, mask: Mask) -> Mask:
+    """A few pixels within the liquid."""
+    only = np.zeros_like(mask)
+    rows, columns = np.nonzero(mask)
+    only[rows[::200], columns[::200]] = True
+    return only
+
+
+def dry(name: str, t: int) -> Mask:
+    return np.zeros((160, 240), bool)
+
+
+def later(name: str, t: int) -> Mask:
+    """Liquid that comes after a quarter of the recording."""
+    return splash(name, t) if t >= 5 else dry(name, t)
+
+
+@pytest.mark.parametrize("masks", [none, specks])
+def test_liquid_without_masks_is_found(cameras: dict[str, Camera], masks: Callable[[str, int, Mask], Mask]) -> None:
+    scene = footage(cameras, masks)
+    assert hardly_masked(scene)
+    found = outlines_by_change(scene, NAMES)
+    assert found.keys() == set(NAMES)
+    before, after = agreement(scene, found)
+    assert before < 0.02
+    assert after > 0.8
+    assert {outline.line for outline in found.values()} == {
+        "masks show next to no liquid; it is taken from what changes in its photographs"
+    }
+
+
+def test_frames_before_the_liquid_have_none(cameras: dict[str, Camera]) -> None:
+    found = outlines_by_change(footage(cameras, none, later), NAMES)
+    for name in NAMES:
+        assert sum(int(found[name].masks[t].sum()) for t in range(5)) == 0
+        assert all(found[name].masks[t].any() for t in range(5, 20))
+
+
+def test_nothing_is_found_where_nothing_changes(cameras: dict[str, Camera]) -> None:
+    assert outlines_by_change(footage(cameras, none, dry), NAMES) == {}
+
+
+def test_masks_that_show_the_liquid_stay(cameras: dict[str, Camera]) -> None:
+    for masks in (lambda name, t, mask: mask, eroded):
+        scene = footage(cameras, masks)
+        assert not hardly_masked(scene)
+        assert outlines_by_change(scene, NAMES) == {}
+
+
+def test_masks_elsewhere_stay(cameras: dict[str, Camera]) -> None:
+    """Pixels that do not change are not what the photographs show a part of."""
+
+    def beside(name: str, t: int, mask: Mask) -> Mask:
+        only = np.zeros_like(mask)
+        only[2:5, 2:5] = True
+        return only
+
+    assert outlines_by_change(footage(cameras, beside), NAMES) == {}
+
+
+def test_a_flash_is_no_liquid(cameras: dict[str, Camera]) -> None:
+    """Photographs that change all over tell nothing."""
+    scene: Any = footage(cameras, none, dry)
+    steady = scene.image
+    scene.image = lambda name, t: np.clip(steady(name, t).astype(int) + 12 * (t % 7), 0, 255).astype(np.uint8)
+    assert outlines_by_change(scene, NAMES) == {}
+
+
+def test_one_camera_without_masks_is_left_to_the_others(cameras: dict[str, Camera]) -> None:
+    assert not hardly_masked(footage(cameras, lambda name, t, mask: mask & (name != "2")))
+    assert hardly_masked(footage(cameras, lambda name, t, mask: mask & (name in "12")))
