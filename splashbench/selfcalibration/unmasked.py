@@ -4,8 +4,8 @@ A pixel that differs from the photograph that the recording begins with, or from
 are asked as masks are (outlines.py). Of the answers the one is taken that is most sure of what is beside the liquid:
 where the first photograph shows liquid already, or the median one does, the place that it leaves is in doubt.
 
-What else moves is taken for liquid, too: a hand, a shadow, whatever the container mirrors. That is why masks that there
-are go before it.
+A shadow darkens what it falls on and leaves its hue, so that it is told from liquid where it does not fall on liquid.
+What else moves is taken for liquid: a hand, or what the container mirrors. That is why masks that there are go before.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ _WITHIN, _SMALLER = 0.8, 4.0
 # A change is so many levels of 255 at least, and so many times the usual difference. It is smoothed by this share of
 # the longer side, and by so many pixels at least.
 _LEVELS, _TIMES, _BLUR, _LEAST_BLUR = 10.0, 6.0, 0.002, 0.6
+# A shadow leaves this share of the light at least.
+_DARKEST = 0.4
 # Rounds of questions, and how far beside the liquid answers are compared, as a share of the longer side.
 _ROUNDS, _BESIDE = 8, 0.05
 
@@ -64,13 +66,24 @@ def _surest(sample: Sample) -> Answer | None:
 
 
 def _changed(sample: Sample, plate: NDArray[np.generic]) -> Masks:
-    """Where the photographs of `sample` differ from `plate` [h, w, 3], bool [F, h, w]."""
+    """Where the photographs of `sample` differ from `plate` [h, w, 3] by more than a shadow, bool [F, h, w]."""
     behind = plate.astype(np.float32)
     blur = max(_LEAST_BLUR, _BLUR * max(plate.shape[:2]))
+    smooth = [cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur) for image in sample.images]
     difference = np.stack(
         [cv2.GaussianBlur(np.abs(image - behind).max(axis=2), (0, 0), blur) for image in sample.images]
     )
-    return np.asarray(difference > max(_LEVELS, _TIMES * float(np.median(difference))))
+    least = max(_LEVELS, _TIMES * float(np.median(difference)))
+    shadows = np.stack([_shadow(image, behind, least) for image in smooth])
+    return np.asarray((difference > least) & ~shadows)
+
+
+def _shadow(image: NDArray[np.float32], plate: NDArray[np.float32], least: float) -> Masks:
+    """Where `image` [h, w, 3] is the plate, but darker, or lighter since a shadow left: of its hue to less than `least`
+    levels."""
+    share = (image * plate).sum(axis=2) / np.maximum((plate * plate).sum(axis=2), 1)
+    hue = np.abs(image - share[..., None] * plate).max(axis=2)
+    return np.asarray((share > _DARKEST) & (share < 1 / _DARKEST) & (hue < least))
 
 
 def _doubt(sample: Sample, answer: Answer) -> float:
