@@ -31,6 +31,8 @@ from splashbench.replay import load
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.restyle import filmed_dye, restyled
 from splashbench.scene import Scene
+from splashbench.scene.scene import TrainingScene
+from splashbench.selfcalibration.unmasked import outlines_by_change
 from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
 from splashbench.study.perturbations.setup import MissingCameras
 from splashbench.study.perturbations.timesteps import FewerTimesteps
@@ -257,6 +259,36 @@ def standing() -> list[Path]:
     return [store(figure, "method_standing.png", 130)]
 
 
+class _Unmasked(TrainingScene):
+    """A scene of which no mask shows anything."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._masks = {name: np.zeros((camera.height, camera.width), bool) for name, camera in self.cameras.items()}
+
+    def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
+        return self._masks[camera]
+
+
+def unmasked() -> list[Path]:
+    """The liquid of four scenes as it is found where no mask shows any."""
+    names, frames = ("opaque_bowl", "glossy_bowl", "glass_tank", "clear_liquid"), (4, 12, 24, 44)
+    figure = Figure(figsize=(12, 8.4), layout="constrained")
+    panels = iter(figure.subplots(len(names), len(frames)).flat)
+    for name in names:
+        folder = WORK / f"{name}_240"
+        made(folder, "synth", "scene", name, str(folder), "--size", "240x160", "--times-alone")
+        scene = _Unmasked(Scene.open(folder))
+        view = scene.train[0]
+        found = outlines_by_change(scene, [view])[view].masks
+        for t in frames:
+            panel = bare(next(panels), f"{name}, frame {t}")
+            panel.imshow(scene.image(view, t))
+            if found[t].any():
+                panel.contour(found[t], levels=[0.5], colors=[ORANGE], linewidths=1.0)
+    return [store(figure, "unmasked.png", 110)]
+
+
 def perturbations() -> list[Path]:
     """A training view with each kind of perturbation at its fourth severity; masks as outlines."""
     folder = WORK / "opaque_bowl_recorded"
@@ -442,6 +474,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "method": method,
     "vessels": vessels,
     "standing": standing,
+    "unmasked": unmasked,
     "rims": rims,
     "perturbations": perturbations,
     "tutorial": tutorial,

@@ -38,8 +38,10 @@ _SIDE = 480
 _ROUNDS, _ROUNDS_MORE = 3, 5
 # Bins of a channel; pixels that every bin has besides, and the width by which bins are smoothed.
 _BINS, _BESIDE, _SMOOTHED = 16, 0.002, 0.8
-# No bin says more than this, in nats; the sum of both says liquid above this much. Colour alone has to say so much.
-_MOST, _FROM, _SURE = 6.0, 0.3, 2.0
+# No bin says more than this, in nats; the sum of both says liquid above this much.
+_MOST, _FROM = 6.0, 0.3
+#: Colour alone has to say so much, in nats.
+SURE = 2.0
 # Deep inside is more than so many pixels, and in the first round deeper than this share of all that is inside: of masks
 # that reach far beyond the liquid only the innermost is liquid. Far outside: in pixels, and as a share of the longer
 # side.
@@ -131,18 +133,21 @@ class Evidence:
     difference: NDArray[np.float32]
     color: NDArray[np.float32]
 
+    def of_color(self, image: Images) -> NDArray[np.float32]:
+        """How much the colour of each pixel of `image` [H, W, 3] speaks for liquid, in nats."""
+        return np.asarray(self.color[_color_bins(image)])
+
     def each(self, image: Images, plate: Images, free: Masks) -> NDArray[np.float32]:
         """How much each pixel of `image` [H, W, 3] speaks for liquid, in nats: its colour, and where some frame is
         `free` of liquid, so that there is a plate, its difference from this."""
-        color = self.color[_color_bins(image)]
+        color = self.of_color(image)
         return np.where(free, self.difference[_difference_bins(image, plate)] + color, color)
 
     def mask(self, image: Images, plate: Images, free: Masks, told: Masks) -> Masks:
         """What `image` [H, W, 3] says is liquid. Where no frame is `free` of it there is no plate, and
         the colour says so where it is sure, elsewhere the mask that was told."""
-        each = self.each(image, plate, free)
-        smooth = cv2.GaussianBlur(each, (0, 0), max(_LEAST_BLUR, _BLUR * max(image.shape[:2])))
-        return np.where(free | (np.abs(smooth) > _SURE), smooth > _FROM, told)
+        smooth = smoothed(self.each(image, plate, free))
+        return np.where(free | (np.abs(smooth) > SURE), smooth > _FROM, told)
 
 
 @dataclass(frozen=True)
@@ -347,6 +352,11 @@ def _replaced(scene: TrainingScene, name: str, sample: Sample, answer: Answer, m
         return None
     beyond = float(np.median(gained[chosen] / length[chosen]))
     return Outlines(PackedMasks.of(told.shape, ((t, right[t]) for t in chosen)), scene.n_frames, beyond)
+
+
+def smoothed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`values` [H, W, ...] of pixels, so that the noise of single ones has no say."""
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), max(_LEAST_BLUR, _BLUR * max(values.shape[:2]))), np.float32)
 
 
 @cache

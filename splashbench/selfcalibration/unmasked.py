@@ -2,7 +2,8 @@
 
 A pixel that differs from the photograph that the recording begins with, or from the median one, may be liquid. Both
 are asked as masks are (outlines.py). Of the answers the one is taken that is most sure of what is beside the liquid:
-where the first photograph shows liquid already, or the median one does, the place that it leaves is in doubt.
+where the first photograph shows liquid already, or the median one does, the place that it leaves is in doubt. There
+the colours that were learned tell, and all is asked once more.
 
 A shadow darkens what it falls on and leaves its hue, so that it is told from liquid where it does not fall on liquid.
 What else moves is taken for liquid: a hand, or what the container mirrors. That is why masks that there are go before.
@@ -12,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,20 +20,20 @@ from splashbench.observe.silhouettes import outline_distance
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
-from .outlines import FRAMES, Answer, Masks, Outlines, PackedMasks, Sample, asked, said, sampled
+from .outlines import FRAMES, SURE, Answer, Masks, Outlines, PackedMasks, Sample, asked, said, sampled, smoothed
 
 # Masks of less than this share of the image, in the mean, show next to nothing. What changes is no liquid where it is
 # less than that, or more than the other.
 _HARDLY, _MOST = 0.0005, 0.4
 # What there is of masks has to be within what is found by this share, and so much smaller.
 _WITHIN, _SMALLER = 0.8, 4.0
-# A change is so many levels of 255 at least, and so many times the usual difference. It is smoothed by this share of
-# the longer side, and by so many pixels at least.
-_LEVELS, _TIMES, _BLUR, _LEAST_BLUR = 10.0, 6.0, 0.002, 0.6
+# A change is so many levels of 255 at least, and so many times the usual difference.
+_LEVELS, _TIMES = 10.0, 6.0
 # A shadow leaves this share of the light at least.
 _DARKEST = 0.4
-# Rounds of questions, and how far beside the liquid answers are compared, as a share of the longer side.
-_ROUNDS, _BESIDE = 8, 0.05
+# Rounds of questions, and of those after colours had a say. How far beside the liquid answers are compared, as a share
+# of the longer side.
+_ROUNDS, _ROUNDS_MORE, _BESIDE = 8, 5, 0.05
 
 
 def hardly_masked(scene: TrainingScene) -> bool:
@@ -59,22 +59,33 @@ def outlines_by_change(scene: TrainingScene, names: Sequence[str]) -> dict[str, 
 
 def _surest(sample: Sample) -> Answer | None:
     """The answer that is most sure of what is beside the liquid; None where photographs say nothing."""
-    first, median = sample.images[0], np.median(sample.images, axis=0)
-    answers = [asked(sample, _changed(sample, plate), _ROUNDS, may_fail=False) for plate in (first, median)]
-    told = [answer for answer in answers if answer.evidence is not None and answer.masks.any()]
-    return min(told, key=lambda answer: _doubt(sample, answer), default=None)
+    changed = [_changed(sample, plate) for plate in (sample.images[0], np.median(sample.images, axis=0))]
+    answers = [asked(sample, start, _ROUNDS, may_fail=False) for start in changed]
+    told = [(answer, start) for answer, start in zip(answers, changed) if answer.evidence and answer.masks.any()]
+    if not told:
+        return None
+    found, start = min(told, key=lambda pair: _doubt(sample, pair[0]))
+    again = asked(sample, _by_color(sample, found, start), _ROUNDS_MORE, may_fail=False)
+    if again.evidence is None or not again.masks.any():
+        return found
+    return min(again, found, key=lambda answer: _doubt(sample, answer))
+
+
+def _by_color(sample: Sample, found: Answer, changed: Masks) -> Masks:
+    """`found`, with what colours say where they are sure and pixels ever `changed`: liquid that was there in the
+    photograph that others were compared with is not seen by the change, but its leaving is."""
+    assert found.evidence is not None
+    ever = changed.any(axis=0)
+    color = np.stack([smoothed(found.evidence.of_color(image)) for image in sample.images])
+    return np.where(ever & (np.abs(color) > SURE), color > 0, found.masks)
 
 
 def _changed(sample: Sample, plate: NDArray[np.generic]) -> Masks:
     """Where the photographs of `sample` differ from `plate` [h, w, 3] by more than a shadow, bool [F, h, w]."""
     behind = plate.astype(np.float32)
-    blur = max(_LEAST_BLUR, _BLUR * max(plate.shape[:2]))
-    smooth = [cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur) for image in sample.images]
-    difference = np.stack(
-        [cv2.GaussianBlur(np.abs(image - behind).max(axis=2), (0, 0), blur) for image in sample.images]
-    )
+    difference = np.stack([smoothed(np.abs(image - behind).max(axis=2)) for image in sample.images])
     least = max(_LEVELS, _TIMES * float(np.median(difference)))
-    shadows = np.stack([_shadow(image, behind, least) for image in smooth])
+    shadows = np.stack([_shadow(smoothed(image.astype(np.float32)), behind, least) for image in sample.images])
     return np.asarray((difference > least) & ~shadows)
 
 
