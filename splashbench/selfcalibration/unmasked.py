@@ -31,6 +31,9 @@ _WITHIN, _SMALLER = 0.8, 4.0
 _LEVELS, _TIMES = 10.0, 6.0
 # A shadow leaves this share of the light at least.
 _DARKEST = 0.4
+# By so many nats the answer by the median photograph has to be surer than the other: where liquid stands all the time
+# its edges alone change, and the median says that they are all.
+_SURER = 1.0
 # Rounds of questions, and of those after colours had a say. How far beside the liquid answers are compared, as a share
 # of the longer side.
 _ROUNDS, _ROUNDS_MORE, _BESIDE = 8, 5, 0.05
@@ -59,12 +62,16 @@ def outlines_by_change(scene: TrainingScene, names: Sequence[str]) -> dict[str, 
 
 def _surest(sample: Sample) -> Answer | None:
     """The answer that is most sure of what is beside the liquid; None where photographs say nothing."""
-    changed = [_changed(sample, plate) for plate in (sample.images[0], np.median(sample.images, axis=0))]
-    answers = [asked(sample, start, _ROUNDS, may_fail=False) for start in changed]
-    told = [(answer, start) for answer, start in zip(answers, changed) if answer.evidence and answer.masks.any()]
+    first, median = sample.images[0], np.median(sample.images, axis=0)
+    told = []
+    for plate, handicap in ((first, 0.0), (median, _SURER)):
+        start = _changed(sample, plate)
+        answer = asked(sample, start, _ROUNDS, may_fail=False)
+        if answer.evidence is not None and answer.masks.any():
+            told.append((_doubt(sample, answer) + handicap, answer, start))
     if not told:
         return None
-    found, start = min(told, key=lambda pair: _doubt(sample, pair[0]))
+    _, found, start = min(told, key=lambda each: each[0])
     again = asked(sample, _by_color(sample, found, start), _ROUNDS_MORE, may_fail=False)
     if again.evidence is None or not again.masks.any():
         return found
