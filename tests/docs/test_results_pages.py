@@ -280,3 +280,23 @@ def test_the_baselines_are_the_studys(label: str, metric: str, scale: float) -> 
         assert float(cell.split("±")[0].strip(" *")) == pytest.approx(
             float(study[name, metric]["mean"]), abs=scale * 1.001
         )
+
+
+def test_without_masks_the_page_says_what_was_run() -> None:
+    with (RESULTS / "data" / "unmasked.csv").open(encoding="utf-8", newline="") as file:
+        runs = {(row["scene"], row["masks"]): row for row in csv.DictReader(file)}
+    table = first_table("unmasked.md")[2:]
+    names = [cells[0] for cells in table[:-1]]
+    assert {(name, masks) for name in names for masks in ("none", "true")} == set(runs)
+    metrics = ("psnr", "lpips", "miou")
+    for name, overlaps, *cells in table[:-1]:
+        wanted = [float(value) for value in runs[name, "none"]["mask_iou_by_camera"].split()]
+        assert [float(value) for value in overlaps.split(",")] == wanted
+        for masks, cell in zip(("none", "true"), cells, strict=True):
+            for metric, figure in zip(metrics, cell.split("/"), strict=True):
+                places = len(figure.strip().split(".")[1])
+                assert float(figure) == pytest.approx(float(runs[name, masks][metric]), abs=0.501 * 10**-places)
+    for masks, cell in zip(("none", "true"), table[-1][2:], strict=True):
+        for metric, figure in zip(metrics, cell.split("/"), strict=True):
+            mean = statistics.mean(float(runs[name, masks][metric]) for name in names)
+            assert float(figure) == pytest.approx(mean, abs=0.501 * 10 ** -len(figure.strip().split(".")[1]))
