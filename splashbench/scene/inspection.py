@@ -30,10 +30,12 @@ def check_scene(directory: Path) -> list[str]:
                 continue
             empty[camera] += int(read == scene.mask and not array.any())
             full[camera] += int(read == scene.mask and array.all())
+    unmasked = all(empty[camera] == scene.n_frames for camera in scene.train)
+    remedy = ", which `splashbench scene self-calibrate` finds in the photographs" if unmasked else ""
     for camera in scene.cameras:
         folder = scene.mask_path(camera, 0).parent
         if empty[camera] == scene.n_frames:
-            faults.append(f"{folder}: every mask is empty; the camera shows no liquid")
+            faults.append(f"{folder}: every mask is empty; the camera shows no liquid{remedy}")
         if full[camera] == scene.n_frames:
             faults.append(f"{folder}: every mask is full; the camera shows no outline of the liquid")
     for optional in (scene.initial_points, scene.container_mesh, scene.truth_particles):

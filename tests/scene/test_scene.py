@@ -153,3 +153,13 @@ def test_info_tells_what_is_known(balls: Scene) -> None:
     assert facts["frames"] == 8
     assert facts["truth_particles"] is True
     assert facts["sizes"]["7"] == [96, 64]
+
+
+def test_a_scene_without_masks_is_told_how_to_get_some(balls_copy: Path) -> None:
+    scene = Scene.open(balls_copy)
+    for name in scene.train:
+        for t in range(scene.n_frames):
+            Image.fromarray(np.zeros((64, 96), np.uint8)).save(scene.mask_path(name, t))
+        faults = check_scene(balls_copy)
+        assert any(f"{name}: every mask is empty" in fault for fault in faults)
+        assert any("self-calibrate" in fault for fault in faults) == (name == scene.train[-1])

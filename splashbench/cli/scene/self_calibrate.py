@@ -20,9 +20,10 @@ examples:
   splashbench scene self-calibrate real_scene/bowl_001 --out corrected/bowl_001
 
 It looks at the training views alone: at what they show in common of the still surroundings, and at droplets in their
-masks; and it holds masks against photographs. --out writes a copy for any method to be run on: photographs evenly
-exposed and straightened, with the cameras, the clocks and the masks that were found. Test views stay as they are.
-splashsplat does the same by itself before it fits. `splashbench masks sheet OUT --out PNG` draws its outlines.
+masks; and it holds masks against photographs. Where masks are empty, liquid is what changes in these. --out writes a
+copy for any method to be run on: photographs evenly exposed and straightened, with the cameras, the clocks and the
+masks that were found. Test views stay as they are. splashsplat does the same by itself before it fits.
+`splashbench masks sheet OUT --out PNG` draws its outlines.
 """
 
 

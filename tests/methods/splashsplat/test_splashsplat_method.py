@@ -294,12 +294,12 @@ def test_transparent_carriers_are_dropped(balls: Scene):
     assert 0 < liquid_only(balls, prune_opacity=threshold).carriers.count < liquid_only(balls).carriers.count
 
 
-def test_a_scene_without_masks_is_not_supported(balls: Scene):
+def test_one_training_view_is_not_enough(balls: Scene):
     training = balls.training()
-    training.mask = lambda camera, t: np.zeros((4, 4), dtype=bool)
+    training.train = ("3",)
     support = SplashSplat().supports(training)
     assert not support.ok
-    assert "liquid masks" in support.reason
+    assert support.reason == "needs 2 training views, and has 1"
     assert SplashSplat().supports(balls.training()).ok
 
 

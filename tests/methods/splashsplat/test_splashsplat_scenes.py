@@ -11,6 +11,7 @@ import trimesh
 from PIL import Image
 
 from splashbench.errors import SplashbenchError
+from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Run
 from splashbench.scene import Camera, Scene
 from splashbench.synth.balls import ball_centers
@@ -111,11 +112,31 @@ def test_frames_without_liquid_have_no_carriers_and_draw_nothing(balls_copy: Pat
     assert rendered(fitted, balls_copy, 5).max() > 0
 
 
-def test_a_scene_without_any_liquid_is_not_supported(balls_copy: Path):
+def test_a_scene_without_masks_that_nobody_may_look_for_is_refused(balls_copy: Path):
     set_masks(balls_copy, 0, ("1", "2", "3", "4", "5"), range(8))
-    support = SplashSplat().supports(Scene.open(balls_copy).training())
-    assert not support.ok
-    assert "masks" in support.reason
+    training = Scene.open(balls_copy).training()
+    assert SplashSplat().supports(training).ok
+    with pytest.raises(SplashbenchError, match="have any liquid in their masks"):
+        SplashSplat().fit(training, SplashSplatConfig.preset("quick", TINY | {"self_calibration": False}), Run(seed=0))
+
+
+def test_liquid_that_no_mask_shows_is_fitted_by_what_changes(balls: Scene, balls_copy: Path, tmp_path: Path):
+    set_masks(balls_copy, 0, ("1", "2", "3", "4", "5"), range(8))
+    config = SplashSplatConfig.preset("quick", TINY | {"background_preset": "quick"})
+    run = Run(seed=0)
+    # Somebody watches: the draft that comes first then has to wait for the masks.
+    run._checkpoints = Checkpoints(tmp_path / "checkpoints", [1e9], lambda: 7.0, lambda: None)
+    fitted = SplashSplat().fit(Scene.open(balls_copy).training(), config, run)
+    assert run.notes["self-calibration"].count("masks show next to no liquid") == 5
+    assert run.stages["draft"] > 0
+    told = SplashSplat().fit(balls.training(), config, Run(seed=0))
+
+    def overlap(each: FittedSplashSplat) -> float:
+        opaque = np.stack([rendered(each, balls_copy, t) > 0.5 for t in range(8)])
+        true = np.stack([balls.mask("6", t) for t in range(8)])
+        return float((opaque & true).sum() / (opaque | true).sum())
+
+    assert overlap(fitted) > overlap(told) - 0.03
 
 
 def test_one_frame_is_a_still(balls_copy: Path):
