@@ -199,7 +199,8 @@ def self_calibration(
         return SelfCalibration()
     step = float(np.median(np.diff(scene.times))) if scene.n_frames > 1 else 1.0
     found = SelfCalibration(seconds_per_step=step)
-    if hardly_masked(scene):
+    unmasked = hardly_masked(scene)
+    if unmasked:
         # First of all: whatever else is looked for leaves out the liquid.
         told("looking for liquid that no mask shows")
         found = replace(found, outlines=outlines_by_change(scene, scene.train))
@@ -220,9 +221,9 @@ def self_calibration(
     bent = found.cameras is not None and found.cameras.distortion != 0
     sharp = [] if bent else [name for name in scene.train if name not in {*knocks, *found.outlines}]
     by_change = found.outlines
-    if by_change and (bent or knocks):
-        # As photographs are now.
-        by_change = outlines_by_change(replace(found, outlines={}).scene(scene), list(by_change))
+    if unmasked and (bent or knocks):
+        # As photographs are now. One of a camera that was knocked told nothing before.
+        by_change = outlines_by_change(replace(found, outlines={}).scene(scene), scene.train)
     right = replace(found, outlines=by_change).scene(scene)
     held = examined(right, sharp)
     if 2 * len({*by_change, *held.outlines, *held.untrusted}) >= len(scene.train):
