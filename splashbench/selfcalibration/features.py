@@ -96,7 +96,7 @@ def _distinct(likeness: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray
     """Of each row, whether its best column is distinct, and that column."""
     rows, best = np.arange(len(likeness)), likeness.argmax(axis=1)
     nearest = likeness[rows, best]
-    # Without a copy of what is large, and a fifth of the time of a partition.
+    # A partition would copy what is large, and take twice the time or more.
     likeness[rows, best] = -np.inf
     second = likeness.max(axis=1)
     likeness[rows, best] = nearest

@@ -21,7 +21,7 @@ from .exposure import Response, responses
 from .features import find_tracks
 from .outlines import Outlines, examined
 from .stance import Knock, find_knock
-from .unmasked import hardly_masked, outlines_by_change
+from .unmasked import hardly_masked, outlines_by_change, unconfirmed
 
 Plates = Mapping[str, CleanPlate]
 _Values = TypeVar("_Values", np.uint8, np.bool_)
@@ -203,7 +203,7 @@ def self_calibration(
     if unmasked:
         # First of all: whatever else is looked for leaves out the liquid.
         told("looking for liquid that no mask shows")
-        found = replace(found, outlines=outlines_by_change(scene, scene.train))
+        found = replace(found, outlines=outlines_by_change(scene, unconfirmed(scene)))
     told("looking for cameras that moved")
     masked = found.scene(scene)
     knocks = {name: knock for name in scene.train if (knock := find_knock(masked, name)) is not None}
@@ -223,7 +223,8 @@ def self_calibration(
     by_change = found.outlines
     if unmasked and (bent or knocks):
         # As photographs are now. One of a camera that was knocked told nothing before.
-        by_change = outlines_by_change(replace(found, outlines={}).scene(scene), scene.train)
+        moved = replace(found, outlines={}).scene(scene)
+        by_change = outlines_by_change(moved, unconfirmed(moved))
     right = replace(found, outlines=by_change).scene(scene)
     held = examined(right, sharp)
     if 2 * len({*by_change, *held.outlines, *held.untrusted}) >= len(scene.train):

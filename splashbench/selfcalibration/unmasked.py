@@ -20,7 +20,19 @@ from splashbench.observe.silhouettes import outline_distance
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
-from .outlines import FRAMES, SURE, Answer, Masks, Outlines, PackedMasks, Sample, asked, said, sampled, smoothed
+from .outlines import (
+    FRAMES,
+    SURE,
+    Answer,
+    Masks,
+    Outlines,
+    PackedMasks,
+    Sample,
+    asked,
+    said,
+    sampled,
+    smoothed,
+)
 
 # Masks of less than this share of the image, in the mean, show next to nothing. What changes is no liquid where it is
 # less than that, or more than the other.
@@ -45,6 +57,17 @@ def hardly_masked(scene: TrainingScene) -> bool:
     frames = spread_frames(scene.n_frames, FRAMES)
     hardly = [np.mean([scene.mask(name, int(t)).mean() for t in frames]) < _HARDLY for name in scene.train]
     return bool(2 * sum(hardly) >= len(hardly))
+
+
+def unconfirmed(scene: TrainingScene) -> list[str]:
+    """The training cameras of `scene` without any mask, or whose photographs show much more than their masks when they
+    are asked with these: little liquid may be all there is."""
+    samples = {name: sampled(scene, name) for name in scene.train}
+    return [
+        name
+        for name, sample in samples.items()
+        if asked(sample, sample.masks, _ROUNDS).masks.sum() >= _SMALLER * sample.masks.sum()
+    ]
 
 
 def outlines_by_change(scene: TrainingScene, names: Sequence[str]) -> dict[str, Outlines]:
