@@ -11,7 +11,7 @@ from .background import Background, fit_background
 from .settings import BackgroundSettings
 
 #: Of the fit; raised when a change alters what it gives, so that none is taken over from before.
-VERSION = 4
+VERSION = 5
 
 
 def shared_background(

@@ -107,7 +107,9 @@ def fit_model(
                 views = _Views(plates, sizes[iteration], rng)
             view = views.next()
             plate = views.plates[view]
-            gaussians = model.decode(plate.camera.center)
+            counting = min(count_from, grow_from) <= iteration < grow_until
+            # Growth counts visits of all anchors.
+            gaussians = model.decode(plate.camera.center, None if counting else model.in_view(plate.camera))
             means, factors, opacities, colors, scales = gaussians
             image, _ = rasterize(means, factors, opacities, colors, plate.camera, background=behind)
             loss = (1 - _SSIM_WEIGHT) * l1(image, plate.image, plate.seen)
@@ -121,7 +123,6 @@ def fit_model(
                     f"the background's loss is {float(loss.detach())} at iteration {iteration + 1}; see that the "
                     "scene's images and cameras are right, or give another seed"
                 )
-            counting = min(count_from, grow_from) <= iteration < grow_until
             if counting:
                 means.retain_grad()
             loss.backward()

@@ -45,7 +45,7 @@ class ScaffoldGS(GaussianMethod):
 
     id: ClassVar[str] = "scaffold_gs"
     title: ClassVar[str] = "Scaffold-GS, static"
-    version: ClassVar[str] = "2"  # since backgrounds are stored in whole steps
+    version: ClassVar[str] = "3"  # since anchors beside the view are left out
     torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
 

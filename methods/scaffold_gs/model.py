@@ -10,6 +10,8 @@ With anchor position a, log-scales l [6], offsets o [K, 3], feature f [32], view
 Two departures on request. With `base_color` the first three feature channels are added to the colour's logits and start
 at the point's own colour, so that hundreds of iterations suffice instead of tens of thousands. Without
 `view_dependent_shape` opacity and shape see no view direction.
+
+On the CPU a compiled kernel computes this (kernel/decode.py), on other devices torch.
 """
 
 from __future__ import annotations
@@ -26,9 +28,15 @@ from torch import nn
 
 from splashbench.gaussians.anchor_seeds import AnchorSeed
 from splashbench.gaussians.dynamic_model import rotation_matrices
+from splashbench.scene import Camera
+
+from .kernel.decode import Heads, Tables, decode
 
 FEATURES = 32
 HIDDEN = 32
+# A Gaussian is drawn up to so many standard deviations from its mean, and linearised: seen from the side it may reach
+# further. Pixels beside the image that count as within.
+_REACH, _MARGIN = 5.0, 4.0
 # Parameters with a row per anchor; the heads are shared.
 PER_ANCHOR = ("features", "offsets", "log_scales")
 
@@ -114,28 +122,68 @@ class AnchorModel(Anchors):
             shape[:, 3] = 1.0
         return model
 
-    def _inputs(self, eye: NDArray) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the colour head reads, and what the opacity and shape heads read: [N, FEATURES + 3] each."""
-        eye_at = torch.tensor(eye, dtype=torch.float32, device=self.positions.device)
-        direction = nn.functional.normalize(self.positions - eye_at, dim=1)
-        seen = torch.cat([self.features, direction], dim=1)
-        if self.variant.view_dependent_shape:
-            return seen, seen
-        return seen, torch.cat([self.features, torch.zeros_like(direction)], dim=1)
+    def decode(self, eye: NDArray, rows: torch.Tensor | None = None) -> DecodedGaussians:
+        """The Gaussians as seen from `eye` [3]. rows: int64 [n], ascending, the anchors that are decoded; all by
+        default."""
+        if self.positions.device.type != "cpu":
+            return self.decode_by_torch(eye, rows)
+        heads = (self.opacity_head, self.shape_head, self.color_head)
+        found = decode(
+            Tables(self.features, self.offsets, self.log_scales, self.positions),
+            Heads(
+                tuple(parameter for part in heads for parameter in part.parameters()),
+                self.variant.view_dependent_shape,
+                self.variant.base_color,
+            ),
+            torch.tensor(eye, dtype=torch.float32),
+            rows,
+        )
+        return DecodedGaussians(*[children.flatten(0, 1) for children in found])
 
-    def decode(self, eye: NDArray) -> DecodedGaussians:
-        """The Gaussians as seen from `eye` [3]."""
-        rows = len(self) * self.variant.children
-        seen, blind = self._inputs(eye)
-        opacity = torch.tanh(self.opacity_head(blind)).view(rows)
-        shape = self.shape_head(blind).view(len(self), self.variant.children, 7)
-        scales = (torch.exp(self.log_scales[:, None, 3:]) * torch.sigmoid(shape[..., :3])).view(rows, 3)
-        factors = rotation_matrices(shape[..., 3:].reshape(rows, 4)) * scales[:, None]
-        logits = self.color_head(seen).view(len(self), self.variant.children, 3)
+    def decode_by_torch(self, eye: NDArray, rows: torch.Tensor | None = None) -> DecodedGaussians:
+        """The same on any device: the definition."""
+        tables = (self.positions, self.features, self.offsets, self.log_scales)
+        positions, features, offsets, log_scales = (t if rows is None else t.index_select(0, rows) for t in tables)
+        n, k = offsets.shape[:2]
+        eye_at = torch.tensor(eye, dtype=positions.dtype, device=positions.device)
+        direction = nn.functional.normalize(positions - eye_at, dim=1)
+        seen = torch.cat([features, direction], dim=1)
+        blind = seen if self.variant.view_dependent_shape else torch.cat([features, 0 * direction], dim=1)
+        opacity = torch.tanh(self.opacity_head(blind)).view(n * k)
+        shape = self.shape_head(blind).view(n, k, 7)
+        scales = (torch.exp(log_scales[:, None, 3:]) * torch.sigmoid(shape[..., :3])).view(n * k, 3)
+        factors = rotation_matrices(shape[..., 3:].reshape(n * k, 4)) * scales[:, None]
+        logits = self.color_head(seen).view(n, k, 3)
         if self.variant.base_color:
-            logits = logits + self.features[:, None, :3]
-        means = self.positions[:, None] + self.offsets * torch.exp(self.log_scales[:, None, :3])
-        return DecodedGaussians(means.view(rows, 3), factors, opacity, torch.sigmoid(logits).view(rows, 3), scales)
+            logits = logits + features[:, None, :3]
+        means = positions[:, None] + offsets * torch.exp(log_scales[:, None, :3])
+        return DecodedGaussians(means.view(n * k, 3), factors, opacity, torch.sigmoid(logits).view(n * k, 3), scales)
+
+    @torch.no_grad()
+    def in_view(self, camera: Camera) -> torch.Tensor:
+        """Which anchors may show in `camera`, int64 [n], ascending: the prefilter of Scaffold-GS.
+
+        It keeps whatever reaches within the pyramid of view, and some that does not.
+        """
+        place = self.positions @ _to(camera.w2c[:3, :3].T, self.positions) + _to(camera.w2c[:3, 3], self.positions)
+        extents = self.log_scales.exp()
+        reach = (self.offsets.abs().amax(dim=1) * extents[:, :3]).norm(dim=1) + _REACH * extents[:, 3:].amax(dim=1)
+        shown = place[:, 2] > -reach
+        for plane in _sides(camera):
+            shown &= place @ _to(plane, self.positions) > -reach
+        return shown.nonzero()[:, 0]
+
+
+def _to(values: NDArray, like: torch.Tensor) -> torch.Tensor:
+    return torch.as_tensor(np.ascontiguousarray(values), dtype=like.dtype, device=like.device)
+
+
+def _sides(camera: Camera) -> NDArray[np.float64]:
+    """Normals [4, 3] of the sides of the pyramid of view, which point inwards, in the camera's frame; a few pixels are
+    added on each side, as Gaussians are drawn a little larger than they are."""
+    left, top, right, bottom = -_MARGIN, -_MARGIN, camera.width + _MARGIN, camera.height + _MARGIN
+    edges = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]], dtype=np.float64) @ camera.K
+    return edges / np.linalg.norm(edges, axis=1, keepdims=True)
 
 
 def first_offsets(n: int, children: int, dimensions: int, spread: bool) -> torch.Tensor:

@@ -45,7 +45,7 @@ _COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "25"
+VERSION = "26"
 
 
 class SplashSplatConfig(MethodConfig):

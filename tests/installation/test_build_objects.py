@@ -68,7 +68,7 @@ def test_a_folder_of_sources_in_a_room_or_a_method_is_a_kernel(tree: Path) -> No
 
 
 def test_the_kernels_of_this_checkout() -> None:
-    assert [kernel.name for kernel in build_kernel.kernels()] == ["splashsplat", "observe", "render"]
+    assert [kernel.name for kernel in build_kernel.kernels()] == ["scaffold_gs", "splashsplat", "observe", "render"]
     assert build_kernel.headers_for(build_kernel.NATIVE)
 
 

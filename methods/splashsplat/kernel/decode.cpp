@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "multiply.h"
+#include "native/multiply.h"
 #include "native/elementary.h"
 #include "native/threads.h"
 

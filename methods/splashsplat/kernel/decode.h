@@ -11,16 +11,12 @@
 
 #include "api.h"
 #include "native/buffer.h"
-#include "native/simd.h"
+#include "native/lanes.h"
 
 namespace splash {
 
-constexpr int BLOCK = 64;
 // Sums over carriers are taken piece by piece and then in the pieces' order, whoever computed them.
 constexpr int BLOCKS_PER_PIECE = 8;
-static_assert(BLOCK % (2 * LANES) == 0, "whole tiles of multiply.h");
-
-inline int in_vectors(int count) { return (count + LANES - 1) / LANES * LANES; }
 
 // Where a block's quantities stand, in rows of BLOCK floats: what the backward pass needs of the forward pass.
 struct Rows {
@@ -81,24 +77,6 @@ inline void prefetch_features(const SplashCarriers& c, int size, int64_t i) {
     if (i + BLOCK >= c.count) return;
     const float* const next = c.features + row_of(c, i + BLOCK) * size;
     for (int j = 0; j < size; j += 16) prefetch(next + j);
-}
-
-// rows[j][i] = source[i][j] for `count` rows of `width` floats; lanes beyond them are zero, and so are all without a source.
-inline void to_lanes(const float* source, int width, int count, float* rows) {
-    if (source == nullptr) count = 0;
-    for (int i = 0; i < count; ++i) {
-        for (int j = 0; j < width; ++j) rows[j * BLOCK + i] = source[i * width + j];
-    }
-    for (int j = 0; j < width; ++j) {
-        for (int i = count; i < BLOCK; ++i) rows[j * BLOCK + i] = 0.0f;
-    }
-}
-
-// target[i][j] = rows[j][i] for `count` rows of `width` floats, `step` floats apart.
-inline void from_lanes(const float* rows, int width, int count, float* target, int step) {
-    for (int i = 0; i < count; ++i) {
-        for (int j = 0; j < width; ++j) target[i * step + j] = rows[j * BLOCK + i];
-    }
 }
 
 void decode(const Weights&, const SplashCarriers&, const SplashChildren&, float* kept, float* cell_colors,

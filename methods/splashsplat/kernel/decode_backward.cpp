@@ -4,7 +4,7 @@
 #include <cmath>
 
 #include "decode.h"
-#include "multiply.h"
+#include "native/multiply.h"
 #include "native/elementary.h"
 #include "native/threads.h"
 

@@ -1,0 +1,1 @@
+"""The compiled decoder of static anchors."""
