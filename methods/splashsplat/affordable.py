@@ -14,6 +14,7 @@ from splashbench.scene.scene import TrainingScene
 from .fields.container import KnownContainer
 from .reconstruction import Traced, trace_liquid
 from .settings import SplashSplatConfig
+from .smaller import draft_of
 
 # Hull cells along the longest side that may be chosen.
 _CELLS = (128, 160, 200, 240, 300)
@@ -73,7 +74,7 @@ def within_seconds(
     if seconds is None:
         return Affordable(config)
     start = run.seconds
-    draft = config.draft()
+    draft = draft_of(config)
     traced = trace_liquid(scene, draft, run, known)
     took = max(run.seconds - start, 1e-3)
     cells = max(traced.observations.hull_grid.shape) - 1
@@ -108,7 +109,7 @@ def _cells_of(traced: Traced, config: SplashSplatConfig) -> int:
     """Hull cells along the longest side that `config` has on a scene whose draft was `traced`."""
     cells = max(traced.observations.hull_grid.shape) - 1
     # By the pixels that a voxel of the draft spans, unless there were too many or too few for that.
-    draft = config.draft()
+    draft = draft_of(config)
     if config.voxel_pixels == 0 or cells >= draft.hull_cells or cells <= draft.fewest_cells:
         return config.hull_cells
     return min(config.hull_cells, max(config.fewest_cells, round(cells * draft.voxel_pixels / config.voxel_pixels)))

@@ -18,6 +18,7 @@ from .fields.container import KnownContainer
 from .fields.observations import Sightings
 from .reconstruction import Reconstruction, fit_liquid, trace_liquid
 from .settings import SplashSplatConfig
+from .smaller import coarse_of
 
 # Share of it that the trace takes, for the progress bar only.
 _TRACE = 0.4
@@ -50,7 +51,7 @@ def fit_coarsely(
     """
     middle = span[0] + _TRACE * (span[1] - span[0])
     # What the observations say is noted by the fine ones.
-    traced = trace_liquid(scene, config.coarse(), run.aside((span[0], middle)), known, before)
+    traced = trace_liquid(scene, coarse_of(config), run.aside((span[0], middle)), known, before)
     learned: list[Learned] = []
     found = fit_liquid(scene, behind, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)
     if learned and offer is not None:

@@ -21,6 +21,7 @@ from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
 from .reconstruction import Reconstruction, fit_liquid, trace_liquid
 from .settings import SplashSplatConfig
+from .smaller import draft_of
 
 if TYPE_CHECKING:
     from ..scaffold_gs import Background, Plates
@@ -44,14 +45,14 @@ def make_draft(
     """Fit a draft of `scene`; returns it.
 
     config: that of the fit. run: see `Run.aside`. plates: gives what the training views show without the liquid.
-    opaque: see `SplashSplatConfig.draft`. offer: is given what makes the draft as it is, and whether there will be no
+    opaque: see `draft_of`. offer: is given what makes the draft as it is, and whether there will be no
     other for a while; at the end, too.
     """
     from ..scaffold_gs import BackgroundSettings, clean_plates, completed, fit_background, flat_background
 
     first = clean_plates(scene, n_frames=1)
     background = flat_background(first)
-    coarse = config.draft(opaque)
+    coarse = draft_of(config, opaque)
 
     def settled() -> dict[str, np.ndarray]:
         nonlocal background

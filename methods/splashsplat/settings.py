@@ -1,7 +1,6 @@
-"""Settings of SplashSplat and its presets.
+"""Settings of SplashSplat.
 
-"paper" is the supplement's "Implementation Details"; "best" departs from it where that was measured to help; "quick"
-is for a first look within minutes. The paper's ablations are `variant` and, with two children, `separation_weight=0`.
+What presets set is in presets.py. The paper's ablations are `variant` and, with two children, `separation_weight=0`.
 """
 
 from __future__ import annotations
@@ -25,21 +24,11 @@ from .carriers.tracking import CarrierSettings, TrackingVariant
 from .fields.observations import FieldSettings
 from .motion.observed_frames import MotionSettings
 from .motion.velocity import VelocitySettings
+from .presets import PRESETS
 
 if TYPE_CHECKING:
     from ..scaffold_gs import BackgroundSettings
 
-
-# Of the draft: what a few seconds allow, and the share of them before its background.
-_DRAFT_ITERATIONS = 400
-_DRAFT_PLATES_SHARE = 0.25
-# How far beyond the surface carriers of opaque liquid are born, in voxels.
-_DRAFT_SHELL_OUTSIDE = 0.125
-# And the edge of its hull voxels in pixels, and how few there are at least.
-_DRAFT_PIXELS, _DRAFT_FEWEST = 1.6, 112
-# Hull cells of the coarse grids, at most. Edge of their voxels at the least, in fine ones: in an opaque container, and
-# in a transparent one.
-_COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 
 # Share of the iterations, the last ones, in which it is measured what may be stored how coarsely.
 _MEASURED = 0.2
@@ -271,95 +260,7 @@ class SplashSplatConfig(MethodConfig):
         "feature_size": (8, 8, 16, 16, 32),
         "iterations": (500, 1000, 2000, 4000, 8000),
     }
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "best": {"storage_tolerance": 0.01},
-        "auto": {
-            "observable": True,
-            "validation_share": 0.04,
-            "price": 0.1,
-            "coarse_grids_share": 0.0,
-        },
-        "paper": {
-            "hull_cells": 176,
-            "transport_cells": 96,
-            "control_cells": 24,
-            "voxel_pixels": 0.0,
-            "clear_voxel_pixels": 0.0,
-            "control_grid": "sides",
-            "signed_distance": "carve",
-            "container": False,
-            "container_masks": False,
-            "container_footage": False,
-            "cut_at_rim": False,
-            "detect_failed_masks": False,
-            "replace_empty_masks": False,
-            "self_calibration": False,
-            "camera_times": False,
-            "repeats": False,
-            "pool": False,
-            "ballistic": False,
-            "gate_motion": False,
-            "visible_only": False,
-            "velocity_smooth": "field",
-            "velocity_smoothing_unit": "transport",
-            "kill_inside": None,
-            "cell_capacity": None,
-            "lifetime": None,
-            "shell_depth": 3.0,
-            "coverage_reach": 0.0,
-            "max_per_cell": 5,
-            "interior_per_cell": None,
-            "children": 2,
-            "base_scale": 0.35,
-            "offset_bound": 1.0,
-            "opacity_band": 3.0,
-            "opacity_bias": 1.0,
-            "silhouette_weight": 0.7,
-            "scale_residual": "linear",
-            "feature_size": 32,
-            "color_width": 64,
-            "iterations": 3000,
-            "coarse_grids_share": 0.0,
-            "learning_rate_features": 2e-3,
-            "learning_rate_heads": 2e-3,
-            "learning_rate_scales": 2e-3,
-            "feature_cells": (),
-            "still_cell": 0.0,
-            "anneal": False,
-            "silhouette_norm": "image",
-            "velocity_steps": 35,
-            "velocity_carry_on": False,
-            "composition": "together",
-            "between_frames": "forward",
-            "validation_share": 0.0,
-            "prune_opacity": 0.0,
-            "idle_share": 0.0,
-            "clear_idle_early": False,
-            "coarse_share": 0.0,
-            "coarsest_share": 0.0,
-            "plates_share": 0.0,
-            "glass": 0,
-            "beside_weight": 0.0,
-            "first_look": False,
-            "background_preset": "paper",
-            "draft_cells": 0,
-        },
-        "quick": {
-            "hull_cells": 160,
-            "transport_cells": 80,
-            "control_cells": 20,
-            "cell_capacity": 6,
-            "min_per_cell": 3,
-            "max_per_cell": 4,
-            "shell_outside": 0.125,
-            "iterations": 800,
-            "coarse_grids_share": 0.0,
-            "plates_share": 0.0,
-            "validation_share": 0.04,
-            "ssim_every": 2,
-            "background_preset": "quick",
-        },
-    }
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
 
     @model_validator(mode="after")
     def _room_for_the_first_look(self) -> SplashSplatConfig:
@@ -438,67 +339,6 @@ class SplashSplatConfig(MethodConfig):
                 "idle_early": self.idle_early or self.clear_idle_early,
             }
         )
-
-    def draft(self, opaque: bool = False) -> SplashSplatConfig:
-        """The settings of the draft: coarse carriers of each frame alone, and few iterations. opaque: whether nothing
-        is known to show through the liquid."""
-        return self.model_copy(
-            update={
-                # So coarse a surface is off by a part of a voxel. Carriers beyond it make clear liquid too wide.
-                "shell_outside": max(self.shell_outside, _DRAFT_SHELL_OUTSIDE if opaque else 0.0),
-                "hull_cells": max(16, self.draft_cells),
-                "transport_cells": max(16, self.draft_cells // 2),
-                "voxel_pixels": _DRAFT_PIXELS,
-                "clear_voxel_pixels": _DRAFT_PIXELS,
-                "fewest_cells": _DRAFT_FEWEST,
-                "control_cells": 4,
-                "observable": False,
-                "detect_failed_masks": False,
-                "tight_bounds": False,
-                "cut_at_rim": False,
-                "pool": False,
-                "ballistic": False,
-                "variant": "per_frame",
-                "interior_per_cell": 1,
-                "shell_depth": 3.0,
-                "still_cell": 0.0,
-                "iterations": _DRAFT_ITERATIONS,
-                "coarse_grids_share": 0.0,
-                "validation_share": 0.0,
-                "idle_share": 0.0,
-                "glass": 0,
-                "plates_share": _DRAFT_PLATES_SHARE,
-                # What it takes to measure what may be stored how coarsely is worth it for a fit that is kept.
-                "storage_tolerance": 0.0,
-            }
-        )
-
-    def coarse(self) -> SplashSplatConfig:
-        """The settings of the fit on coarse grids that the fit begins with."""
-        return self.model_copy(
-            update={
-                "hull_cells": self._coarser(self.hull_cells, _COARSE_CELLS, 16),
-                "transport_cells": self._coarser(self.transport_cells, _COARSE_CELLS // 2, 8),
-                "control_cells": self._coarser(self.control_cells, _COARSE_CELLS // 8, 4),
-                "fewest_cells": self._coarser(self.fewest_cells, _COARSE_CELLS, 16),
-                "voxel_pixels": _COARSE_PIXELS * self.voxel_pixels,
-                "clear_voxel_pixels": _COARSE_PIXELS_CLEAR * self.clear_voxel_pixels,
-                "cell_capacity": 6,
-                "min_per_cell": 3,
-                "max_per_cell": 4,
-                "shell_outside": 0.125,
-                "iterations": self.coarse_iterations,
-                "coarse_grids_share": 0.0,
-                "coarse_share": 1.0,
-                "coarsest_share": 1.0 if self.coarsest_share > 0 else 0.0,
-                "plates_share": 0.0,  # nothing else comes behind the liquid
-                "storage_tolerance": 0.0,
-            }
-        )
-
-    @staticmethod
-    def _coarser(cells: int, most: int, fewest: int) -> int:
-        return max(fewest, min(most, round(cells / _COARSE_PIXELS)))
 
     @property
     def carriers(self) -> CarrierSettings:

@@ -11,11 +11,12 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from splashbench.files import read_json, write_json, write_model
+from splashbench.files import read_json, write_json, write_model, write_png
 from splashbench.scene import Scene, SceneMeta, write_scene
 from splashbench.scene.container import mesh_path
 from splashbench.scene.layout import plain_name
 from splashbench.scene.source import RELEASED_FILES, ReleasedSource
+from splashbench.scene.writer import to_gray
 
 
 def make_training_copy(scene: Scene, directory: Path, kept: Sequence[int] | None = None) -> Path:
@@ -36,8 +37,13 @@ def make_training_copy(scene: Scene, directory: Path, kept: Sequence[int] | None
                 write_json(directory / name, split | {key: [split[key][t] for t in kept] for key in ("k", "w2c", "fn")})
         for camera in scene.train:
             for t in kept:
-                for path in (scene.image_path(camera, t), scene.mask_path(camera, t)):
-                    _link(path, directory / path.relative_to(scene.directory))
+                image, mask = scene.image_path(camera, t), scene.mask_path(camera, t)
+                _link(image, directory / image.relative_to(scene.directory))
+                if camera in scene.unmasked:
+                    # Who reads the folder without splashbench finds masks where they belong.
+                    write_png(directory / mask.relative_to(scene.directory), to_gray(scene.mask(camera, t)))
+                else:
+                    _link(mask, directory / mask.relative_to(scene.directory))
         write_model(directory / "scene.json", meta)
     else:
         pairs = ((camera, i, t) for camera in scene.train for i, t in enumerate(kept))

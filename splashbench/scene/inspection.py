@@ -23,6 +23,8 @@ def check_scene(directory: Path) -> list[str]:
     pairs = [(camera, t) for camera in scene.cameras for t in range(scene.n_frames)]
     for camera, t in track(pairs, "checking the scene"):
         for read in (scene.image, scene.mask):
+            if read == scene.mask and camera in scene.unmasked:
+                continue
             try:
                 array = read(camera, t)
             except SplashbenchError as error:
@@ -30,9 +32,14 @@ def check_scene(directory: Path) -> list[str]:
                 continue
             empty[camera] += int(read == scene.mask and not array.any())
             full[camera] += int(read == scene.mask and array.all())
-    unmasked = all(empty[camera] == scene.n_frames for camera in scene.train)
+    unmasked = all(camera in scene.unmasked or empty[camera] == scene.n_frames for camera in scene.train)
     remedy = ", which `splashbench scene self-calibrate` finds in the photographs" if unmasked else ""
-    for camera in scene.cameras:
+    folder, without = scene.directory / "seg", ", ".join(name for name in scene.test if name in scene.unmasked)
+    if scene.unmasked.issuperset(scene.train):
+        faults.append(f"{folder}: there are no masks of the training cameras, so that they show no liquid{remedy}")
+    if without:
+        faults.append(f"{folder}: there are no masks of test cameras ({without}), within which they would be scored")
+    for camera in (name for name in scene.cameras if name not in scene.unmasked):
         folder = scene.mask_path(camera, 0).parent
         if empty[camera] == scene.n_frames:
             faults.append(f"{folder}: every mask is empty; the camera shows no liquid{remedy}")
@@ -57,6 +64,7 @@ def describe_scene(scene: Scene) -> dict:
     coverage = {
         camera: float(np.mean([scene.mask(camera, t).mean() for t in range(0, scene.n_frames, 5)]))
         for camera in scene.cameras
+        if camera not in scene.unmasked
     }
     points = scene.initial_points()
     return {

@@ -44,6 +44,8 @@ class Scene:
             from "neurofluid"'s fixed interval, or are "nominal".
         camera_times: camera name -> [T] seconds, each camera's own where known, else `times`.
         gravity: unit vector [3] along which things fall, or None. metres_per_unit: metric scale, or None.
+        unmasked: cameras that have no masks at all. Those of training cameras count as empty, those of test cameras
+            are an error once they are asked for.
         container_transparent: whether the liquid is seen through the container's walls, or None where unknown.
         is_released: whether this is one of the 20 released scenes, in the release's units.
     """
@@ -52,6 +54,7 @@ class Scene:
         self._source = source
         self.directory, self.layout = source.directory, source.layout
         self.name, self.meta = source.name, source.meta
+        self.unmasked = source.unmasked
         train, test = source.train, source.test
         self.train, self.test = train.names, test.names
         self.frames = tuple(Path(path).stem for path in train.paths[train.names[0]])
@@ -141,6 +144,14 @@ class Scene:
 
     def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
         """Liquid mask [H, W] of `camera` at timestep `t`."""
+        if camera in self.unmasked and camera in self.test:
+            raise SplashbenchError(
+                f"{self.mask_path(camera, t).parent} is missing; test views are scored within masks of the "
+                "liquid, so put them there"
+            )
+        if camera in self.unmasked:
+            view = self.cameras[camera]
+            return np.zeros((view.height, view.width), dtype=bool)
         return self._sized(camera, self.mask_path(camera, t), self._source.mask(camera, t))
 
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
@@ -227,7 +238,8 @@ class Scene:
         files = self._source.calibration_files()
         for camera in sorted(self.cameras):
             for t in range(self.n_frames):
-                files += [self.image_path(camera, t), self.mask_path(camera, t)]
+                files.append(self.image_path(camera, t))
+                files += [] if camera in self.unmasked else [self.mask_path(camera, t)]
         for path in dict.fromkeys(files):
             if not path.is_file():
                 raise SplashbenchError(f"{path} is missing; restore it, or leave its frame out of the JSON files")

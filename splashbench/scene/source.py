@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from abc import ABC, abstractmethod
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -51,6 +53,11 @@ class SceneSource(ABC):
     train: Split
     test: Split
     times_source: str = META_FILE
+
+    @property
+    def unmasked(self) -> frozenset[str]:
+        """The cameras that have no masks at all."""
+        return frozenset()
 
     @abstractmethod
     def image_path(self, camera: str, t: int) -> Path:
@@ -123,6 +130,17 @@ class ReleasedSource(SceneSource):
             )
         self.train, self.test = train, test
         self._paths = train.paths | test.paths
+
+    @cached_property
+    def unmasked(self) -> frozenset[str]:
+        """Test cameras that have no folder in seg/, and all training cameras where none has one. With a folder in seg/
+        that is of no camera they are none: its name is a mistake, and masks are missing."""
+        folders = {name: self.mask_path(name, 0).parent for name in (*self.train.names, *self.test.names)}
+        without = {name for name, folder in folders.items() if not os.path.lexists(folder)}
+        seg = self.directory / "seg"
+        if not set(seg.iterdir() if seg.is_dir() else ()) <= set(folders.values()):
+            return frozenset()
+        return frozenset(without if without.issuperset(self.train.names) else without.intersection(self.test.names))
 
     def image_path(self, camera: str, t: int) -> Path:
         return self.directory / "ims" / self._paths[camera][t]

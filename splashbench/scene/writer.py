@@ -21,7 +21,7 @@ def write_scene(
     train: Sequence[str],
     test: Sequence[str],
     n_frames: int,
-    frames: Iterable[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_]]],
+    frames: Iterable[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_] | None]],
     meta: SceneMeta,
     initial_points: NDArray | None = None,
     container_masks: Mapping[str, NDArray[np.bool_]] | None = None,
@@ -35,7 +35,8 @@ def write_scene(
         train: camera names of the training split.
         test: camera names of the test split.
         n_frames: number of timesteps T.
-        frames: yields (camera, t, image uint8 [H, W, 3], liquid mask [H, W]) once for each shown camera and timestep.
+        frames: yields (camera, t, image uint8 [H, W, 3], liquid mask [H, W]) once for each shown camera and timestep;
+            None in place of all masks of a camera that has none.
         meta: scene.json; its `sizes` are filled in here.
         initial_points: [N, 7] x, y, z, r, g, b, seg, for init_pt_cld.npz.
         container_masks: name -> [H, W].
@@ -45,16 +46,19 @@ def write_scene(
     directory = Path(directory)
     shown = set(cameras if shown is None else shown)
     directory.mkdir(parents=True, exist_ok=True)
-    for folder in ("ims", "seg"):
-        for name in shown:
-            (directory / folder / name).mkdir(parents=True, exist_ok=True)
+    for name in shown:
+        (directory / "ims" / name).mkdir(parents=True, exist_ok=True)
     written: set[tuple[str, int]] = set()
     for name, t, image, mask in track(frames, "writing the scene", total=n_frames * len(shown)):
         camera = cameras[name]
-        if image.shape != (camera.height, camera.width, 3) or mask.shape != (camera.height, camera.width):
-            raise ValueError(f"camera {name}, frame {t}: image {image.shape} or mask {mask.shape} is not {camera}")
+        size = (camera.height, camera.width)
+        outline = size if mask is None else mask.shape
+        if image.shape != (*size, 3) or outline != size:
+            raise ValueError(f"camera {name}, frame {t}: image {image.shape} or mask {outline} is not {camera}")
         write_image(directory / "ims" / name / f"{t:06d}.{image_format}", image)
-        write_png(directory / "seg" / name / f"{t:06d}.png", to_gray(mask))
+        if mask is not None:
+            (directory / "seg" / name).mkdir(parents=True, exist_ok=True)
+            write_png(directory / "seg" / name / f"{t:06d}.png", to_gray(mask))
         written.add((name, t))
     if len(written) != n_frames * len(shown):
         raise ValueError(f"{len(written)} of {n_frames * len(shown)} images were given")

@@ -23,11 +23,12 @@ def write_calibrated(scene: Scene, found: SelfCalibration, directory: Path) -> N
     right = found.scene(scene.training())
     names = [*scene.train, *scene.test]
 
-    def frames() -> Iterator[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_]]]:
+    def frames() -> Iterator[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_] | None]]:
         for name in names:
             views = right if name in right.cameras else scene
             for t in range(scene.n_frames):
-                yield name, t, views.image(name, t), views.mask(name, t)
+                without = name in scene.unmasked and name in scene.test
+                yield name, t, views.image(name, t), None if without else views.mask(name, t)
 
     masks = {name: (right if name in right.cameras else scene).container_mask(name) for name in names}
     # Without scene.json the folder's name decides what a scene is; times that nobody stated stay unstated.

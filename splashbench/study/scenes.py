@@ -156,7 +156,7 @@ def _perturb(copy: Scene, scene: Scene, recording: Recording, worse: Recording) 
             # Nothing is decoded that no step changes.
             if worse.mask is not recording.mask:
                 mask = worse.mask(name, t)
-                if not np.array_equal(mask, scene.mask(name, t)):
+                if name in scene.unmasked or not np.array_equal(mask, scene.mask(name, t)):
                     write_png(copy.mask_path(name, t), np.where(mask, 255, 0).astype(np.uint8))
             if worse.image is recording.image:
                 continue

@@ -1,6 +1,7 @@
 """Scenes on disk: the released layout with and without scene.json, and what is said when something is wrong."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,11 @@ import pytest
 from PIL import Image
 
 from splashbench.errors import SplashbenchError
+from splashbench.harness.training_copy import make_training_copy
 from splashbench.scene import Scene
 from splashbench.scene.inspection import check_scene, describe_scene
+from splashbench.selfcalibration import SelfCalibration
+from splashbench.selfcalibration.writing import write_calibrated
 from splashbench.synth.balls import ball_centers
 
 
@@ -163,3 +167,64 @@ def test_a_scene_without_masks_is_told_how_to_get_some(balls_copy: Path) -> None
         faults = check_scene(balls_copy)
         assert any(f"{name}: every mask is empty" in fault for fault in faults)
         assert any("self-calibrate" in fault for fault in faults) == (name == scene.train[-1])
+
+
+def _without_masks(scene: Path, *cameras: str) -> None:
+    for name in cameras:
+        shutil.rmtree(scene / "seg" / name)
+
+
+def test_training_cameras_without_any_folder_of_masks_have_none(balls_copy: Path, tmp_path: Path) -> None:
+    told = Scene.open(balls_copy)
+    digest = told.digest
+    _without_masks(balls_copy, *told.train)
+    scene = Scene.open(balls_copy)
+    assert scene.unmasked == set(scene.train)
+    assert scene.mask(scene.train[0], 1).shape == (64, 96)
+    assert not scene.training().mask(scene.train[0], 1).any()
+    assert np.array_equal(scene.mask(scene.test[0], 1), told.mask(scene.test[0], 1))
+    assert scene.digest != digest
+    faults = check_scene(balls_copy)
+    assert len(faults) == 1
+    assert "seg: there are no masks of the training cameras" in faults[0]
+    assert "self-calibrate" in faults[0]
+    assert describe_scene(scene)["mask_coverage"].keys() == set(scene.test)
+    copy = Scene.open(make_training_copy(scene, tmp_path / "copy"))
+    assert not copy.mask(scene.train[0], 1).any()
+    assert copy.mask_path(scene.train[0], 1).is_file()
+
+
+def test_without_any_masks_a_scene_reads_and_says_what_scoring_needs(balls_copy: Path, tmp_path: Path) -> None:
+    shutil.rmtree(balls_copy / "seg")
+    scene = Scene.open(balls_copy)
+    assert scene.unmasked == set(scene.cameras)
+    assert len(scene.digest) == 64
+    faults = check_scene(balls_copy)
+    assert len(faults) == 2
+    assert "no masks of test cameras" in faults[1]
+    with pytest.raises(SplashbenchError, match=rf"seg/{scene.test[0]} is missing; test views are scored within masks"):
+        scene.mask(scene.test[0], 0)
+    write_calibrated(scene, SelfCalibration(), tmp_path / "copy")
+    copy = Scene.open(tmp_path / "copy")
+    assert copy.unmasked == set(scene.test)
+    assert len(copy.digest) == 64
+
+
+def test_a_folder_of_masks_with_another_name_is_a_mistake_and_not_taken_for_none(balls_copy: Path) -> None:
+    scene = Scene.open(balls_copy)
+    first = scene.train[0]
+    _without_masks(balls_copy, *scene.train[1:])
+    assert not Scene.open(balls_copy).unmasked
+    (balls_copy / "seg" / first).rename(balls_copy / "seg" / f"camera_{first}")
+    mistaken = Scene.open(balls_copy)
+    assert not mistaken.unmasked
+    with pytest.raises(SplashbenchError, match=rf"seg/{first}/000000.png"):
+        mistaken.mask(first, 0)
+
+
+def test_a_broken_link_in_place_of_masks_is_not_taken_for_none(balls_copy: Path) -> None:
+    scene = Scene.open(balls_copy)
+    _without_masks(balls_copy, *scene.train)
+    (balls_copy / "seg" / scene.train[0]).symlink_to(balls_copy / "nowhere")
+    with pytest.raises(SplashbenchError, match=r"000000\.png"):
+        Scene.open(balls_copy).mask(scene.train[1], 0)

@@ -16,7 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.gaussians.devices import CPU
+
 from ..carriers.population import Carriers
+from ..kernel.shared import SharedRows, added_by_member
 from .active import chosen
 from .cells import cell_numbers
 from .optimizer import RowAdam
@@ -60,6 +63,8 @@ class SharedFeatures:
         self._own, self._adam = own, RowAdam(own, own_rate)
         ids = self._ids = [of_frame.to(own.device) for of_frame in ids]
         self._levels: list[_FeatureLevel] = []
+        # On the CPU, what adds the levels up.
+        self._rows: SharedRows | None = None
         extents = [(size, size) for size in sizes]
         if still_size > 0:
             extents.append((still_size, np.inf))
@@ -72,6 +77,9 @@ class SharedFeatures:
             cells = torch.from_numpy(cells_of(born, size, frames, rng.random(4)).astype(np.int32)).to(own.device)
             table = own.new_zeros(int(cells.max()) + 1 if len(cells) else 0, own.shape[1])
             self._levels.append(_FeatureLevel(cells, table, RowAdam(table, shared_rate), *_by_frame(cells, ids)))
+        if own.device.type == CPU and own.dtype == torch.float32:
+            levels = self._levels
+            self._rows = SharedRows(own, [level.table for level in levels], [level.cells for level in levels])
 
     def keep(self, ids: list[Tensor]) -> None:
         """Go on with the carriers `ids` of each frame alone."""
@@ -93,7 +101,7 @@ class SharedFeatures:
     def joined(self) -> Tensor:
         """`all`, in the place of their own parts: the end of sharing."""
         self._summed(self._own)
-        self._levels = []
+        self._levels, self._rows = [], None
         del self._adam  # no step comes after this
         return self._own
 
@@ -113,12 +121,19 @@ class SharedFeatures:
         """Descend along the `gradient` [n, width] of what `of_frame` gave; `factor` scales the rates."""
         self._adam.step(chosen(self._ids[t], places), gradient, factor)
         for level in self._levels:
-            # Sums by int32 take six times as long.
-            rows, members = level.rows[t], chosen(level.members[t], places).to(torch.int64)
-            summed = gradient.new_zeros(len(rows), gradient.shape[1]).index_add_(0, members, gradient)
-            level.adam.step(rows, summed, factor)
+            level.adam.step(level.rows[t], self._summed_by_cell(level, t, gradient, places), factor)
+
+    def _summed_by_cell(self, level: _FeatureLevel, t: int, gradient: Tensor, places: Tensor | None) -> Tensor:
+        rows, members = level.rows[t], level.members[t]
+        if self._rows is not None:
+            return added_by_member(gradient, members, len(rows), places)
+        # Sums by int32 take six times as long.
+        of_rows = chosen(members, places).to(torch.int64)
+        return gradient.new_zeros(len(rows), gradient.shape[1]).index_add_(0, of_rows, gradient)
 
     def _sum(self, ids: Tensor) -> Tensor:
+        if self._rows is not None:
+            return self._rows.of(ids)
         features = self._own.index_select(0, ids)
         for level in self._levels:
             features += level.table.index_select(0, level.cells.index_select(0, ids))

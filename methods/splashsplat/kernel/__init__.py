@@ -1,1 +1,1 @@
-"""SplashSplat's own compiled kernel: decoder, losses of an image window, Adam by rows, and the fit of velocities."""
+"""SplashSplat's compiled kernel: decoder, window losses, Adam by rows, shared features, and the fit of velocities."""

@@ -8,6 +8,7 @@
 #include "decode.h"
 #include "descend.h"
 #include "native/threads.h"
+#include "shared.h"
 #include "window_loss.h"
 
 namespace splash {
@@ -56,6 +57,15 @@ int splash_decode_backward(const SplashHeads* heads, const SplashCarriers* carri
 void splash_adam_rows(const SplashRowAdam* adam, int64_t count, const int64_t* rows, const float* gradient, float rate,
                       int32_t threads) {
     splash::adam_rows(*adam, count, rows, gradient, rate, splash::workers(threads));
+}
+
+void splash_sum_rows(const SplashSharedRows* shared, int64_t count, const int64_t* ids, float* sums, int32_t threads) {
+    splash::sum_rows(*shared, count, ids, sums, splash::workers(threads));
+}
+
+void splash_add_by_member(int64_t count, int64_t width, const int64_t* places, const int32_t* members, const float* rows,
+                          int64_t groups, float* sums) {
+    splash::add_by_member(count, width, places, members, rows, groups, sums);
 }
 
 int splash_window_losses(const SplashWindow* window, const float* image, const float* opacity, double losses[3],

@@ -11,7 +11,7 @@ extern "C" {
 #endif
 
 // Raised with every change to what follows; the loader refuses another version.
-#define SPLASH_ABI_VERSION 2
+#define SPLASH_ABI_VERSION 3
 
 // Heads that turn n carriers' features into K children each (decode.py): weights [outputs, inputs], biases [outputs].
 typedef struct SplashHeads {
@@ -79,6 +79,24 @@ typedef struct SplashRowAdam {
 } SplashRowAdam;
 SPLASH_API void splash_adam_rows(const SplashRowAdam*, int64_t count, const int64_t* rows, const float* gradient, float rate,
                                  int32_t threads);
+
+// What is added up for each carrier: a row of its own, [., width], and at each level the row of the table that its cell has.
+#define SPLASH_MAX_LEVELS 8
+typedef struct SplashSharedRows {
+    int64_t width;
+    const float* own;
+    int32_t levels;                             // up to SPLASH_MAX_LEVELS
+    const float* tables[SPLASH_MAX_LEVELS];     // [., width]
+    const int32_t* cells[SPLASH_MAX_LEVELS];    // [carriers]
+} SplashSharedRows;
+
+// sums [count, width]: of the carriers `ids` [count].
+SPLASH_API void splash_sum_rows(const SplashSharedRows*, int64_t count, const int64_t* ids, float* sums, int32_t threads);
+
+// sums [groups, width], overwritten: of the `rows` [count, width] by group, added in their order. Row i is of the group
+// members[places[i]]; places: null: members[i].
+SPLASH_API void splash_add_by_member(int64_t count, int64_t width, const int64_t* places, const int32_t* members,
+                                     const float* rows, int64_t groups, float* sums);
 
 // A rendered window and what is known of it: photograph and mask of a box within; outside, the mask is empty.
 typedef struct SplashWindow {

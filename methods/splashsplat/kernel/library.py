@@ -76,6 +76,21 @@ class RowAdamStruct(Structure):
     )
 
 
+MAX_LEVELS = 8
+
+
+class SharedRowsStruct(Structure):
+    """SplashSharedRows."""
+
+    _fields_ = (
+        ("width", c_int64),
+        ("own", c_void_p),
+        ("levels", c_int32),
+        ("tables", c_void_p * MAX_LEVELS),
+        ("cells", c_void_p * MAX_LEVELS),
+    )
+
+
 class WindowStruct(Structure):
     """SplashWindow."""
 
@@ -136,6 +151,8 @@ _FUNCTIONS: dict[str, Signature] = {
         ),
     ),
     "splash_adam_rows": (None, (POINTER(RowAdamStruct), c_int64, c_void_p, c_void_p, c_float, c_int32)),
+    "splash_sum_rows": (None, (POINTER(SharedRowsStruct), c_int64, c_void_p, c_void_p, c_int32)),
+    "splash_add_by_member": (None, (c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_int64, c_void_p)),
     "splash_descend": (None, (POINTER(DescentStruct), c_void_p, c_void_p, c_int32)),
     "splash_window_losses": (c_int32, (POINTER(WindowStruct), c_void_p, c_void_p, c_double * 3, c_int32)),
     "splash_window_gradients": (
@@ -144,4 +161,4 @@ _FUNCTIONS: dict[str, Signature] = {
     ),
 }
 
-KERNEL = CompiledKernel("splashsplat", Path(__file__).parent, abi_version=2, functions=_FUNCTIONS)
+KERNEL = CompiledKernel("splashsplat", Path(__file__).parent, abi_version=3, functions=_FUNCTIONS)

@@ -16,8 +16,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Budget, Fitted, Run
 from splashbench.scene import Scene, TrainingScene
 from splashbench_methods import scaffold_gs
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, reconstruction
-from splashbench_methods.splashsplat import settings as settings_module
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, reconstruction, smaller
 from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.fitting import Fit
 from splashbench_methods.splashsplat.appearance.warm_start import Learned
@@ -103,7 +102,7 @@ def test_who_looks_on_changes_nothing(
 ) -> None:
     """With a draft, and states on the way."""
     on_cores(monkeypatch, threads)
-    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    monkeypatch.setattr(smaller, "_DRAFT_ITERATIONS", 20)
     monkeypatch.setattr(course, "transmittance", lambda *_: share)
     images = []
     for watched in (False, True):
@@ -127,7 +126,7 @@ def test_a_draft_does_not_wait_for_all_that_the_footage_tells_of_a_container(
     monkeypatch.setattr(course, "make_draft", lambda *given: (draft(*given), done.append("draft"))[0])
     for name in ("standing_roughly", "standing_about_liquid"):
         monkeypatch.setattr(course, name, look(name))
-    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    monkeypatch.setattr(smaller, "_DRAFT_ITERATIONS", 20)
     run = Run()
     run._checkpoints = Checkpoints(tmp_path, [0.0, 1e9], lambda: 7.0, lambda: None)
     fitted(balls, run, iterations=20, draft_cells=32, container=False, container_masks=False)
@@ -227,7 +226,7 @@ def test_transparent_liquid_is_shown_before_the_background_first(
 ) -> None:
     """The draft with a coarse background, the same liquid before the fitted one, and the coarse grids'."""
     on_cores(monkeypatch, cores)
-    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    monkeypatch.setattr(smaller, "_DRAFT_ITERATIONS", 20)
     monkeypatch.setattr(course, "transmittance", lambda *_: 1.0)
     run, offered = Run(), []
     shown = milestones(run, tmp_path, monkeypatch)

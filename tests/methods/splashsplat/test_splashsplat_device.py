@@ -20,8 +20,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Run
 from splashbench.render import autograd, backends
 from splashbench.scene import Scene
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course
-from splashbench_methods.splashsplat import settings as settings_module
+from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, smaller
 from splashbench_methods.splashsplat.appearance import fitting, losses
 from splashbench_methods.splashsplat.appearance.compositing import composite
 from splashbench_methods.splashsplat.appearance.decoder import Children
@@ -132,7 +131,7 @@ def test_a_fit_there_is_the_cpus(
     preset, settings = CASES[case]
     if case not in ("best", "paper"):  # these look at it, and draw its Gaussians with the liquid's
         request.getfixturevalue("flat_background")
-    monkeypatch.setattr(settings_module, "_DRAFT_ITERATIONS", 20)
+    monkeypatch.setattr(smaller, "_DRAFT_ITERATIONS", 20)
     monkeypatch.setattr(fitting, "_LOOK_EVERY", 20)
     monkeypatch.setattr(fitting, "_BEFORE", 30)
     if case == "glass":
