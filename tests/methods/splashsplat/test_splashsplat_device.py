@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Run
 from splashbench.render import autograd, backends
 from splashbench.scene import Scene
+from splashbench_methods.scaffold_gs.model import AnchorModel, StaticAnchorSpec
 from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, smaller
 from splashbench_methods.splashsplat.appearance import fitting, losses
 from splashbench_methods.splashsplat.appearance.compositing import composite
@@ -142,8 +144,28 @@ def test_a_fit_there_is_the_cpus(
     # Sums in another order end in another fit, a little; and, where a trial goes the other way, in another step.
     assert np.quantile(np.abs(images - expected), 0.99) < (1e-2 if case == "storing" else 1e-3)
     fitted.to_device(device)
-    assert np.abs(_images(fitted, balls) - images).max() < 1e-5
+    # A Gaussian at the least opacity that is drawn, 1/255, may be drawn there and not here.
+    beside = np.abs(_images(fitted, balls) - images)
+    assert np.quantile(beside, 0.999) < 1e-5
+    assert beside.max() < 1 / 255
     assert fitted.gaussians(float(balls.times[2]), balls.cameras["6"].center) is not None
+
+
+def test_anchors_of_the_background_there(balls: Scene, device: str) -> None:
+    torch.manual_seed(0)
+    model = AnchorModel(200, StaticAnchorSpec(2))
+    for table in (model.positions, model.features.data, model.offsets.data, model.log_scales.data):
+        table.normal_()
+    camera = balls.cameras["1"]
+    with torch.no_grad():
+        rows = model.in_view(camera)
+        expected = model.decode(camera.center, rows)
+        there = copy.deepcopy(model).to(device)
+        assert torch.equal(there.in_view(camera).cpu(), rows)
+        found = there.decode(camera.center, there.in_view(camera))
+    for theirs, ours in zip(expected, found):
+        assert isinstance(ours, VirtualTensor)
+        assert float(((theirs - ours.cpu()).abs() / (1 + theirs.abs())).max()) < 1e-5
 
 
 def test_liquid_behind_a_wall_there(balls: Scene, device: str) -> None:
