@@ -107,6 +107,7 @@ IN_TREE = {
     for folder, name in (
         ("splashbench/observe", "observe"),
         ("splashbench/render", "render"),
+        ("methods/scaffold_gs", "scaffold_gs"),
         ("methods/splashsplat", "splashsplat"),
     )
     for variant in ("baseline", "avx2", "avx512")

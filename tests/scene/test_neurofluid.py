@@ -200,8 +200,8 @@ def test_a_methods_copy_has_the_training_views_alone(watersphere: Path, tmp_path
     np.testing.assert_allclose(shown.times, scene.times)
     assert shown.gravity is not None
     assert shown.truth_particles() is None
-    for read in (shown.image, shown.mask):
-        with pytest.raises(SplashbenchError, match=r"view_5/000000.png does not exist"):
+    for read, says in ((shown.image, r"view_5/000000\.png does not exist"), (shown.mask, "seg/view_5 is missing")):
+        with pytest.raises(SplashbenchError, match=says):
             read("view_5", 0)
     # Neither the truth nor a way to the folder that has it.
     files = [path.relative_to(tmp_path / "view") for path in (tmp_path / "view").rglob("*") if not path.is_dir()]
