@@ -163,15 +163,16 @@ class AnchorModel(Anchors):
     def in_view(self, camera: Camera) -> torch.Tensor:
         """Which anchors may show in `camera`, int64 [n], ascending: the prefilter of Scaffold-GS.
 
-        It keeps whatever reaches within the pyramid of view, and some that does not.
+        It keeps whatever reaches within the pyramid of view, and some that does not; and what is no number, which the
+        loss shows then.
         """
         place = self.positions @ _to(camera.w2c[:3, :3].T, self.positions) + _to(camera.w2c[:3, 3], self.positions)
         extents = self.log_scales.exp()
         reach = (self.offsets.abs().amax(dim=1) * extents[:, :3]).norm(dim=1) + _REACH * extents[:, 3:].amax(dim=1)
-        shown = place[:, 2] > -reach
+        beside = place[:, 2] < -reach
         for plane in _sides(camera):
-            shown &= place @ _to(plane, self.positions) > -reach
-        return shown.nonzero()[:, 0]
+            beside |= place @ _to(plane, self.positions) < -reach
+        return (~beside).nonzero()[:, 0]
 
 
 def _to(values: NDArray, like: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <new>
 
 namespace splash {
@@ -52,5 +53,13 @@ class Buffer {
     T* data_ = nullptr;
     size_t capacity_ = 0;
 };
+
+// The first place in a caller's memory that vectors may start at; so many floats more hold what is asked for.
+constexpr int64_t ALIGNMENT_FLOATS = 16;
+template <class T>
+T* aligned(T* at) {
+    const uintptr_t bytes = ALIGNMENT_FLOATS * sizeof(T);
+    return reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(at) + bytes - 1) / bytes * bytes);
+}
 
 }  // namespace splash

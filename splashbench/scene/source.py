@@ -133,13 +133,18 @@ class ReleasedSource(SceneSource):
 
     @cached_property
     def unmasked(self) -> frozenset[str]:
-        """Test cameras that have no folder in seg/, and all training cameras where none has one. With a folder in seg/
-        that is of no camera they are none: its name is a mistake, and masks are missing."""
+        """Test cameras that have no folder in seg/, and all training cameras where none has one. They are none where
+        seg/ is something else, a link to nowhere for one, or has a folder that is of no camera: that is a mistake, and
+        masks are missing."""
         folders = {name: self.mask_path(name, 0).parent for name in (*self.train.names, *self.test.names)}
-        without = {name for name, folder in folders.items() if not os.path.lexists(folder)}
         seg = self.directory / "seg"
-        if not set(seg.iterdir() if seg.is_dir() else ()) <= set(folders.values()):
+        try:
+            inside = list(seg.iterdir()) if os.path.lexists(seg) else []
+        except OSError:
             return frozenset()
+        if any(path.is_dir() and path not in folders.values() for path in inside):
+            return frozenset()
+        without = {name for name, folder in folders.items() if not os.path.lexists(folder)}
         return frozenset(without if without.issuperset(self.train.names) else without.intersection(self.test.names))
 
     def image_path(self, camera: str, t: int) -> Path:

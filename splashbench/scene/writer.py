@@ -46,8 +46,6 @@ def write_scene(
     directory = Path(directory)
     shown = set(cameras if shown is None else shown)
     directory.mkdir(parents=True, exist_ok=True)
-    for name in shown:
-        (directory / "ims" / name).mkdir(parents=True, exist_ok=True)
     written: set[tuple[str, int]] = set()
     for name, t, image, mask in track(frames, "writing the scene", total=n_frames * len(shown)):
         camera = cameras[name]
@@ -57,7 +55,6 @@ def write_scene(
             raise ValueError(f"camera {name}, frame {t}: image {image.shape} or mask {outline} is not {camera}")
         write_image(directory / "ims" / name / f"{t:06d}.{image_format}", image)
         if mask is not None:
-            (directory / "seg" / name).mkdir(parents=True, exist_ok=True)
             write_png(directory / "seg" / name / f"{t:06d}.png", to_gray(mask))
         written.add((name, t))
     if len(written) != n_frames * len(shown):

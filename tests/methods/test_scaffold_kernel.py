@@ -198,6 +198,14 @@ def test_what_a_camera_sees_needs_no_anchor_out_of_its_view(angle, focal, distan
     assert float((every - some).abs().max()) < 2e-3
 
 
+def test_what_is_no_number_is_not_left_out_unseen():
+    model = anchors(50, size=0.01)
+    with torch.no_grad():
+        model.log_scales[3, 4] = np.nan
+        model.offsets[7, 0, 1] = np.nan
+    assert {3, 7} <= set(model.in_view(camera(0.4, 4000.0, 5.0)).tolist())
+
+
 def test_most_of_what_lies_beside_the_image_is_left_out():
     model = anchors(2000, size=0.01)
     with torch.no_grad():

@@ -222,6 +222,26 @@ def test_a_folder_of_masks_with_another_name_is_a_mistake_and_not_taken_for_none
         mistaken.mask(first, 0)
 
 
+@pytest.mark.parametrize("what", ["link to nowhere", "file"])
+def test_something_else_in_place_of_seg_is_not_taken_for_no_masks(balls_copy: Path, what: str) -> None:
+    shutil.rmtree(balls_copy / "seg")
+    if what == "file":
+        (balls_copy / "seg").write_text("masks.zip")
+    else:
+        (balls_copy / "seg").symlink_to(balls_copy / "unmounted")
+    scene = Scene.open(balls_copy)
+    assert not scene.unmasked
+    with pytest.raises(SplashbenchError, match="seg/"):
+        scene.mask(scene.train[0], 0)
+
+
+def test_what_a_file_browser_leaves_in_seg_is_no_camera(balls_copy: Path) -> None:
+    scene = Scene.open(balls_copy)
+    _without_masks(balls_copy, *scene.train)
+    (balls_copy / "seg" / ".DS_Store").write_bytes(b"x")
+    assert Scene.open(balls_copy).unmasked == set(scene.train)
+
+
 def test_a_broken_link_in_place_of_masks_is_not_taken_for_none(balls_copy: Path) -> None:
     scene = Scene.open(balls_copy)
     _without_masks(balls_copy, *scene.train)

@@ -13,8 +13,6 @@
 
 namespace splash {
 
-// Sums over anchors are taken piece by piece and then in the pieces' order, whoever computed them.
-constexpr int BLOCKS_PER_PIECE = 8;
 constexpr int HEADS = 3;
 
 // Where a block's quantities stand, in rows of BLOCK floats: what the backward pass needs of the forward pass.
@@ -57,18 +55,6 @@ struct Weights {
     int first_step;  // floats in a row of `first`
     Buffer<float> first;
 };
-
-struct Part {
-    int64_t begin;
-    int count;
-};
-
-inline int64_t blocks_of(int64_t anchors) { return (anchors + BLOCK - 1) / BLOCK; }
-inline int64_t pieces_of(int64_t anchors) { return (blocks_of(anchors) + BLOCKS_PER_PIECE - 1) / BLOCKS_PER_PIECE; }
-inline Part part_of(int64_t anchors, int64_t block) {
-    const int64_t begin = block * BLOCK;
-    return {begin, static_cast<int>(anchors - begin < BLOCK ? anchors - begin : BLOCK)};
-}
 
 // The row of the tables that anchor i has.
 inline int64_t row_of(const SplashAnchors& a, int64_t i) { return a.rows == nullptr ? i : a.rows[i]; }

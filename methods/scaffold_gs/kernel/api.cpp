@@ -7,20 +7,6 @@
 #include "anchors.h"
 #include "native/threads.h"
 
-namespace splash {
-namespace {
-
-// The first place in the caller's memory that vectors may start at.
-constexpr int64_t ALIGNMENT_FLOATS = 16;
-template <class T>
-T* aligned(T* at) {
-    const uintptr_t bytes = ALIGNMENT_FLOATS * sizeof(T);
-    return reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(at) + bytes - 1) / bytes * bytes);
-}
-
-}  // namespace
-}  // namespace splash
-
 extern "C" {
 
 int64_t splash_anchors_kept(const SplashHeads* heads, int64_t anchors) {

@@ -15,9 +15,6 @@
 
 namespace splash {
 
-// Sums over carriers are taken piece by piece and then in the pieces' order, whoever computed them.
-constexpr int BLOCKS_PER_PIECE = 8;
-
 // Where a block's quantities stand, in rows of BLOCK floats: what the backward pass needs of the forward pass.
 struct Rows {
     explicit Rows(const SplashHeads& heads)
@@ -55,19 +52,6 @@ struct Weights {
     int first_step, second_step;    // floats in a row of each matrix
     Buffer<float> first, second;
 };
-
-// The carriers of one block.
-struct Part {
-    int64_t begin;
-    int count;
-};
-
-inline int64_t blocks_of(int64_t carriers) { return (carriers + BLOCK - 1) / BLOCK; }
-inline int64_t pieces_of(int64_t carriers) { return (blocks_of(carriers) + BLOCKS_PER_PIECE - 1) / BLOCKS_PER_PIECE; }
-inline Part part_of(int64_t carriers, int64_t block) {
-    const int64_t begin = block * BLOCK;
-    return {begin, static_cast<int>(carriers - begin < BLOCK ? carriers - begin : BLOCK)};
-}
 
 // The row of the tables that carrier i has.
 inline int64_t row_of(const SplashCarriers& c, int64_t i) { return c.rows == nullptr ? i : c.rows[i]; }

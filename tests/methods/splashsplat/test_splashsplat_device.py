@@ -143,12 +143,15 @@ def test_a_fit_there_is_the_cpus(
     images = _images(fitted, balls)
     # Sums in another order end in another fit, a little; and, where a trial goes the other way, in another step.
     assert np.quantile(np.abs(images - expected), 0.99) < (1e-2 if case == "storing" else 1e-3)
+    seen_from = (float(balls.times[2]), balls.cameras["6"].center)
+    before = fitted.gaussians(*seen_from)
     fitted.to_device(device)
+    for ours, theirs in zip(vars(before).values(), vars(fitted.gaussians(*seen_from)).values()):
+        assert np.abs(ours - theirs).max(initial=0) < 1e-5
     # A Gaussian at the least opacity that is drawn, 1/255, may be drawn there and not here.
     beside = np.abs(_images(fitted, balls) - images)
     assert np.quantile(beside, 0.999) < 1e-5
     assert beside.max() < 1 / 255
-    assert fitted.gaussians(float(balls.times[2]), balls.cameras["6"].center) is not None
 
 
 def test_anchors_of_the_background_there(balls: Scene, device: str) -> None:
