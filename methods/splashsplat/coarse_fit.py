@@ -25,12 +25,12 @@ _TRACE = 0.4
 
 
 def begins_on_coarse_grids(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> bool:
-    """Whether the fit of `scene` by `config` has such a part: where photographs are small, with a fixed schedule,
-    without a budget, and where plates stand for the background at first."""
+    """Whether the fit of `scene` by `config` has such a part: where photographs are small, learning rates fall from the
+    start on, there is no budget, and plates stand for the background at first."""
     plates = config.plates_share > 0 and config.composition != "together"
-    fixed = config.validation_share == 0 and not run.budget.limits
+    falling = (config.validation_share == 0 or config.price > 0) and not run.budget.limits
     longest = max(max(camera.width, camera.height) for camera in scene.cameras.values())
-    return plates and fixed and config.coarse_iterations > 0 and longest <= config.coarse_grids_side
+    return plates and falling and config.coarse_iterations > 0 and longest <= config.coarse_grids_side
 
 
 def fit_coarsely(

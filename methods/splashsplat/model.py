@@ -25,12 +25,13 @@ from .appearance.fitting import Appearance, Composition
 from .appearance.sensitivity import Sensitivity
 from .carriers.between import BetweenFrames
 from .carriers.population import Carriers
+from .carriers.precision import HIGHEST, Precision
 from .carriers.subframe import Track, locate
 from .motion.between import moved_distance
 from .motion.steps import Motion
 from .motion.velocity import Factor
-from .storage.earlier import EARLIER, read_earlier
-from .storage.looks import appearance_arrays, appearance_ranks, learned_values, read_appearance
+from .storage.earlier import EARLIER, UNSORTED, UNSORTED_VALUES, read_earlier, sorted_by_coarseness
+from .storage.looks import VALUES, appearance_arrays, appearance_ranks, learned_values, read_appearance
 from .storage.track import (
     CARRIERS,
     DEFORMATION,
@@ -44,7 +45,7 @@ from .storage.track import (
 
 T = TypeVar("T")
 
-FORMAT = 5
+FORMAT = 6
 # Step in which values are stored where nothing is known of the photographs, of their spread.
 _UNKNOWN_STEP = 0.05
 _AGAIN = "fit the scene again"
@@ -71,7 +72,7 @@ class Liquid:
     nz], see `pack_signed_distance`. carried: whether the motion is what moved the carriers. composition: how it was
     fitted and is drawn: "over" an image of the background, or "together" with the background's Gaussians.
     between_frames: whose carriers are drawn there, see carriers/between.py. arrays: what is stored, by file and name,
-    but phi; none of a model of an earlier version.
+    but phi; none of a model of an earlier version. precision: of what is stored of carriers and motion.
     """
 
     times: np.ndarray
@@ -84,6 +85,7 @@ class Liquid:
     composition: Composition = "over"
     between_frames: BetweenFrames = "both"
     arrays: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    precision: Precision = HIGHEST
     _surface: tuple[float, SignedDistance] | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
@@ -106,7 +108,7 @@ class Liquid:
         known = Sensitivity.of_spread(learned_values(appearance)) if sensitivity is None else sensitivity
         arrays = {
             "carriers": carrier_arrays(track, track.carriers, carried),
-            "motion": motion_arrays(track.motion),
+            "motion": motion_arrays(track),
             "appearance": appearance_arrays(appearance, known, step, track.grid),
         }
         look = read_appearance(arrays["appearance"], Decoder(appearance.decoder.settings), track.grid)
@@ -125,13 +127,23 @@ class Liquid:
     ) -> Liquid:
         carriers, motion = track.carriers, track.motion
         return cls(
-            times, track.grid, carriers, motion, track.phi, appearance, carried, composition, between_frames, arrays
+            times,
+            track.grid,
+            carriers,
+            motion,
+            track.phi,
+            appearance,
+            carried,
+            composition,
+            between_frames,
+            arrays,
+            track.precision,
         )
 
     @property
     def track(self) -> Track:
         """The carriers at any time."""
-        return Track(self.grid, self.carriers, self.motion, self.phi)
+        return Track(self.grid, self.carriers, self.motion, self.phi, self.precision)
 
     @property
     def handed_out(self) -> np.ndarray:
@@ -212,6 +224,7 @@ class Liquid:
                 "voxel": self.grid.voxel,
                 "shape": list(self.grid.shape),
             },
+            "steps": self.precision.steps,
             "factor": self.motion.factor,
             "carried": self.carried,
             "composition": self.composition,
@@ -233,7 +246,7 @@ class Liquid:
         path = directory / "liquid.json"
         header = read_json(path)
         try:
-            if header["format"] not in (FORMAT, *EARLIER):
+            if header["format"] not in (FORMAT, UNSORTED, *EARLIER):
                 raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; {_AGAIN}")
             box = header["grid"]
             nx, ny, nz = (int(n) for n in box["shape"])
@@ -249,20 +262,26 @@ class Liquid:
             if not 1 <= max(settings.feature_size, settings.children, settings.color_width) <= _WIDEST:
                 raise ValueError(f"the decoder's sizes are not between 1 and {_WIDEST}")
             decoder = Decoder(settings)
+            precision = HIGHEST if header["format"] != FORMAT else Precision.stored(header["steps"])
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); {_AGAIN}") from None
         arrays: dict[str, dict[str, np.ndarray]] = {}
         if header["format"] in EARLIER:
             track, look = _fitting(directory, lambda: read_earlier(directory, header, grid, times, factor, decoder))
         else:
+            unsorted = header["format"] == UNSORTED
+            values = UNSORTED_VALUES if unsorted else VALUES
             ranks = {
                 "carriers": {**CARRIERS, **({} if carried else DEFORMATION)},
                 "motion": MOTION,
                 "distance": DISTANCE,
-                "appearance": appearance_ranks(decoder, bool(header.get("glass"))),
+                "appearance": appearance_ranks(decoder, bool(header.get("glass")), values),
             }
             arrays = {name: read_npz(directory / f"{name}.npz", ranks[name]) for name in _FILES}
-            track = _fitting(directory, lambda: read_track(arrays, grid, times, factor))
+            if unsorted:
+                look_path = directory / "appearance.npz"
+                arrays["appearance"] = _fitting(look_path, lambda: sorted_by_coarseness(arrays["appearance"]))
+            track = _fitting(directory, lambda: read_track(arrays, grid, times, factor, precision))
             count = len(arrays["appearance"]["coarseness"])
             if count != track.carriers.count:
                 others = f"{count} carriers, not {track.carriers.count}"

@@ -15,7 +15,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "observable": True,
         "validation_share": 0.04,
         "price": 0.1,
-        "coarse_grids_share": 0.0,
     },
     "paper": {
         "hull_cells": 176,

@@ -31,6 +31,7 @@ from .appearance.sensitivity import Sensitivity
 from .appearance.targets import collect_targets, set_backgrounds
 from .appearance.warm_start import Learned, hand_on
 from .carriers.coverage import uncovered_by_any
+from .carriers.precision import Precision
 from .carriers.subframe import Track
 from .carriers.tracking import CarrierTracker, Simulation, Tracking
 from .carriers.visibility import seen_by_any
@@ -102,7 +103,9 @@ def trace_liquid(
     with run.stage("carriers"):
         memory.give_back()
         steps = reach(config.decoder.opacity_slope, config.decoder.opacity_band)
-        return Traced(observations, stored_track(track, scene.times, config.carried, steps), config)
+        precision = Precision.of(observations.voxel_pixels)
+        run.note("precision", str(precision))
+        return Traced(observations, stored_track(track, scene.times, config.carried, steps, precision), config)
 
 
 def fit_liquid(
@@ -170,13 +173,14 @@ def fit_liquid(
             _clock(run),
             run.device,
             learned,
+            keep is not None,
         )
     memory.forget()  # what comes has other sizes
     appearance = found.appearance
     if keep is not None and fit is not None:
         keep(found)
     if fit is not None and fit.earned:
-        run.decide(iterations_decision(fit.earned, len(fit.losses)))
+        run.decide(iterations_decision(fit.earned, fit.begun + len(fit.losses)))
     if fit is None:
         return reconstruction(appearance, np.ones(track.carriers.count, dtype=bool))
     left = shown(appearance, fit.left)
@@ -319,9 +323,10 @@ def _fit_appearance(
     clock: Clock | None,
     device: str,
     learned: list[Learned] | None,
+    handed_on: bool,
 ) -> tuple[Learned, Fit | None]:
     """What was learned of the carriers of `track`, fitted to the photographs whose masks did not fail; None where there
-    are none. learned: what it begins with."""
+    are none. learned: what it begins with. handed_on: whether another fit begins with what this one learns."""
     voxel = observations.grid.voxel
     appearance = initial_appearance(track.carriers.count, voxel, config.optimisation, config.decoder, seed)
     # Gaussians of the background that are drawn together with the liquid's are prepared for one size.
@@ -353,7 +358,7 @@ def _fit_appearance(
     if not targets:
         return Learned(track, appearance, None), None
     look = photographed(track, targets) if config.first_look else None
-    optimisation = config.optimisation
+    optimisation = replace(config.optimisation, handed_on=handed_on and config.price > 0)
     if learned:
         hand_on(learned.pop(), track, look, appearance, config.base_scale)
         # Of the iterations on these grids, the first ones have stand-ins for the background.

@@ -51,6 +51,8 @@ class SplashSplatConfig(MethodConfig):
     #: edge of a hull voxel by the smallest length that the scene's cameras can show, as measured before the fit, where
     #: that is more than `voxel_pixels`; in place of `clear_voxel_pixels`
     observable: bool = False
+    #: that edge, in this length: two samples of it and a little
+    observable_share: PositiveFloat = Field(0.45, le=4)
     #: hull cells along the longest side that `voxel_pixels` and `clear_voxel_pixels` leave at least
     fewest_cells: int = Field(128, ge=16, le=512)
     #: cells of the grid of motion and carriers, at most
@@ -161,7 +163,8 @@ class SplashSplatConfig(MethodConfig):
     #: steps of the appearance's fit, at most
     iterations: int = Field(4000, ge=0)
     #: share of them, the first ones, made on coarse grids, whose carriers the fine ones begin with; 0 for none. Only
-    #: where the schedule is fixed, the background is not fitted first (`plates_share`), and no budget is to be kept
+    #: where learning rates fall from the start on, the background is not fitted first (`plates_share`), and no budget
+    #: is to be kept
     coarse_grids_share: float = Field(0.2, ge=0, le=0.5)
     #: pixels along the longest side up to which photographs are small enough for that: larger ones show what it loses
     coarse_grids_side: PositiveInt = 320
@@ -308,6 +311,7 @@ class SplashSplatConfig(MethodConfig):
             tight_bounds=self.tight_bounds,
             repeats=self.repeats,
             observable=self.observable,
+            observable_share=self.observable_share,
         )
 
     @property

@@ -61,6 +61,7 @@ def coarse_of(config: SplashSplatConfig) -> SplashSplatConfig:
             "fewest_cells": _coarser(config.fewest_cells, _COARSE_CELLS, 16),
             "voxel_pixels": _COARSE_PIXELS * config.voxel_pixels,
             "clear_voxel_pixels": _COARSE_PIXELS_CLEAR * config.clear_voxel_pixels,
+            "observable_share": _COARSE_PIXELS_CLEAR * config.observable_share,
             "cell_capacity": 6,
             "min_per_cell": 3,
             "max_per_cell": 4,

@@ -9,6 +9,8 @@ What a fit can leave out, it does not pay for:
   do, at no cost where these do not reach;
 - `compact=True` gives tiles instead of images, to be compared with targets that `to_tiles` cut up beforehand.
 
+`compositing_weights` gives the pixels that each Gaussian makes up, without a backward pass.
+
 Opacity is of all that is rendered. For the liquid's visible opacity, before and behind a frozen background, give the
 liquid a further channel of ones and the background one of zeros. That channel then holds it.
 """
@@ -23,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from splashbench.render import arguments, counters, cpu
 from splashbench.render.arguments import Floats
 from splashbench.render.constants import TILE_HEIGHT, TILE_WIDTH
-from splashbench.render.cpu import Frozen, freeze
+from splashbench.render.cpu import Frozen, compositing_weights, freeze
 from splashbench.render.tiles import COLOR, OPACITY, SKIP, from_tiles, tile_grid, tile_modes, to_tiles
 from splashbench.scene.camera import Camera
 
@@ -31,8 +33,8 @@ if TYPE_CHECKING:
     import torch
 
 __all__ = [
-    "COLOR", "OPACITY", "SKIP", "TILE_HEIGHT", "TILE_WIDTH", "Frozen", "counters", "freeze", "from_tiles", "rasterize",
-    "rasterize_arrays", "tile_grid", "tile_modes", "to_tiles",
+    "COLOR", "OPACITY", "SKIP", "TILE_HEIGHT", "TILE_WIDTH", "Frozen", "compositing_weights", "counters", "freeze",
+    "from_tiles", "rasterize", "rasterize_arrays", "tile_grid", "tile_modes", "to_tiles",
 ]  # fmt: skip
 
 Cameras = Camera | Sequence[Camera]

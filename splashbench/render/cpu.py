@@ -1,6 +1,7 @@
 """Gaussians to pixels on the CPU: arrays in, arrays out, around the compiled kernel.
 
-`forward` leaves a Rendering, whose `backward` gives the gradients; `freeze` prepares Gaussians that never change.
+`forward` leaves a Rendering, whose `backward` gives the gradients; `freeze` prepares Gaussians that never change;
+`compositing_weights` says what each one makes up of an image.
 """
 
 from __future__ import annotations
@@ -227,3 +228,37 @@ def forward(
     _raise_for(status, arrays)
     counters.record(len(arrays[0]) + (0 if frozen is None else len(frozen)), f"cpu ({KERNEL.variant})")
     return Rendering(color, opacity, handle, arrays)
+
+
+def compositing_weights(
+    means: Any,
+    factors: Any,
+    opacities: Any,
+    camera: Camera,
+    *,
+    counts: Any = None,
+    frozen: Frozen | None = None,
+) -> Floats:
+    """Pixels that each of N Gaussians makes up: its compositing weights summed over the image, float32 [N].
+
+    means, factors, opacities, frozen: as `splashbench.render.rasterize` takes them. counts: [H, W], how much each pixel
+    counts; 1 by default. This is the derivative of a channel, summed over pixels, by the Gaussian's colour in it, and
+    costs as much as an image of opacity. Raises ValueError or TypeError naming the argument.
+    """
+    arguments.check_camera(camera)
+    arrays, gaussians = _gaussians(means, factors, opacities, None)
+    arguments.check_frozen(frozen, camera, getattr(frozen, "channels", 0), getattr(frozen, "depth", False))
+    by_pixel = None if counts is None else arguments.floats(counts, "counts")
+    if by_pixel is not None and by_pixel.shape != (camera.height, camera.width):
+        raise ValueError(f"counts is {list(by_pixel.shape)}, not {[camera.height, camera.width]}")
+    found = memory.empty((len(arrays[0]),))
+    status = KERNEL.library.splash_weigh(
+        ctypes.byref(_camera(camera)),
+        ctypes.byref(gaussians),
+        _address(by_pixel),
+        None if frozen is None else frozen.handle.frame,
+        kernel_threads(),
+        _address(found),
+    )
+    _raise_for(status, arrays)
+    return found

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splashbench.native.library import CompiledKernel, Signature
 
-ABI_VERSION = 3
+ABI_VERSION = 4
 MAX_CHANNELS = 32
 
 
@@ -72,6 +72,10 @@ _FUNCTIONS: dict[str, Signature] = {
     ),
     "splash_freeze": (c_int32, (POINTER(CameraStruct), POINTER(GaussiansStruct), c_int32, c_int32, POINTER(_FRAME))),
     "splash_backward": (c_int32, (_FRAME, c_void_p, c_void_p, c_int32, POINTER(GradientsStruct))),
+    "splash_weigh": (
+        c_int32,
+        (POINTER(CameraStruct), POINTER(GaussiansStruct), c_void_p, _FRAME, c_int32, c_void_p),
+    ),
     "splash_release": (None, (_FRAME,)),
     "splash_frame_bytes": (c_int64, (_FRAME,)),
     "splash_frame_counts": (None, (_FRAME, c_int64 * 3)),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splashbench.render import Frozen, rasterize
+from splashbench.render import Frozen, compositing_weights, rasterize
 from splashbench.scene.camera import Camera
 
 from .decoder import Children
@@ -93,3 +93,29 @@ def _behind_wall(
     image, alpha = image + wall[..., None] * (background - image), alpha * (1 - wall)
     over, opacity = part(drawn_last, None)
     return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
+
+
+def shares(
+    children: Children,
+    camera: Camera,
+    frozen: Frozen | None = None,
+    wall: Tensor | None = None,
+    in_front: Tensor | None = None,
+    glass: Splats | None = None,
+) -> Tensor:
+    """Pixels of the image of `composite` that each of n carriers makes up, float32 [n], on the CPU: the derivative of a
+    channel, summed over pixels, by its Gaussians' colours. Arguments as there."""
+    shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
+    if glass is not None:
+        parts = (torch.cat(pair) for pair in zip(shapes, (glass.means, glass.factors, glass.opacities)))
+        found = compositing_weights(*parts, camera)[: len(shapes[2])]
+    elif wall is None or in_front is None or not bool(in_front.any()):
+        found = compositing_weights(*shapes, camera, counts=None if wall is None else 1 - wall, frozen=frozen)
+    else:
+        first = in_front.repeat_interleave(children.opacities.shape[1])
+        nearer, farther = (tuple(values[chosen] for values in shapes) for chosen in (first, ~first))
+        _, opacity = rasterize(*nearer, None, camera)
+        found = np.empty(len(first), dtype=np.float32)
+        found[first.numpy()] = compositing_weights(*nearer, camera)
+        found[~first.numpy()] = compositing_weights(*farther, camera, counts=(1 - wall) * (1 - opacity))
+    return torch.from_numpy(found).reshape(children.opacities.shape).sum(dim=1)

@@ -1,9 +1,11 @@
 """How much of a photograph each carrier makes up: the pixels that its Gaussians cover, weighted by how far they show.
 
 A Gaussian's weight in a pixel is its opacity there times the light that those in front let through. Summed over pixels
-this is the derivative of a rendered channel by the Gaussian's colour, so that one backward pass gives the weights of
-all. Carriers deep in the liquid weigh next to nothing. To fit them to the photograph costs as much as any other, and
-Adam's steps do not shrink with the gradient. Not in the paper.
+this is the derivative of a rendered channel by the Gaussian's colour: a backward pass gives the weights of all. On the
+CPU the renderer sums them while it draws, which takes a part of the time (`shares` in compositing.py).
+
+Carriers deep in the liquid weigh next to nothing. To fit them to the photograph costs as much as any other, and Adam's
+steps do not shrink with the gradient. Not in the paper.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from ..kernel.window_loss import WindowPhotograph
 from . import losses
 from .active import Active, ActiveCarriers
 from .averages import Averages, ShownHeads
-from .compositing import composite
+from .compositing import composite, shares
 from .contribution import contributions, least
 from .decoder import Children, Decoder, DecoderSettings, Penalties, initial_log_scale
 from .glass import Glass, GlassFit
@@ -80,7 +80,8 @@ class FitSettings:
 
     iterations: at most. ssim_every: the SSIM term enters every so many of them, weighted up by as much.
     anneal: whether the learning rates fall along a half cosine, where the schedule is fixed. validation_share: of the
-    photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. stop_gain: see
+    photographs, withheld to tell when to let them fall (schedule.py); 0 for a schedule that is fixed. handed_on: they
+    are withheld for a fit that goes on from this one, and the schedule is fixed. stop_gain: see
     `AdaptiveSchedule`. price: see `EarningSchedule`, which is taken where it is above 0. prune_opacity: carriers whose
     learned opacity is below this at one of `_PRUNINGS` are not fitted any further; 0 fits all to the end. idle_share:
     carriers that together make up no more of a photograph than this are not fitted to it; which they are is looked at
@@ -90,12 +91,13 @@ class FitSettings:
     the first ones, that see them at a quarter. plates_share: of the iterations, the first ones, for which the
     background is not needed yet. measured_share: of the iterations, the last ones, in which it is measured how much
     photographs change with what is learned. begun: of the iterations, the first ones, that another fit has made
-    (warm_start.py), where the schedule is fixed.
+    (warm_start.py), where the schedule is fixed or an earning one.
     """
 
     iterations: int = 1000
     begun: int = 0
     validation_share: float = 0.0
+    handed_on: bool = False
     stop_gain: float = 0.01
     price: float = 0.0
     learning_rate_features: float = 0.06
@@ -155,9 +157,10 @@ Drawn = Callable[[int, Tensor, Tensor, Tensor | None], tuple[Tensor, WindowPhoto
 
 @dataclass(frozen=True)
 class Fit:
-    """losses: of every iteration. left: bool [count], the carriers that were fitted to the end. sensitivity: of the
-    photographs to what was learned; None where it was not asked for. drawn: see `Drawn`. photographs: how many targets.
-    earned: what stretches of iterations bought, where that decided how many there were."""
+    """losses: of every iteration; `begun` others came before. left: bool [count], the carriers that were fitted to the
+    end. sensitivity: of the photographs to what was learned; None where it was not asked for. drawn: see `Drawn`.
+    photographs: how many targets. earned: what stretches of iterations bought, where that decided how many there were.
+    """
 
     losses: list[float]
     left: np.ndarray
@@ -165,6 +168,7 @@ class Fit:
     drawn: Drawn
     photographs: int
     earned: tuple[Earned, ...] = ()
+    begun: int = 0
 
 
 class _Moments:
@@ -234,6 +238,24 @@ def penalty_loss(penalties: Penalties, voxel: float, weights: losses.LossWeights
     )
 
 
+def _schedule(settings: FitSettings, count: int, clock: Clock | None, seed: int) -> tuple[Schedule, np.ndarray]:
+    """The schedule of a fit to `count` photographs, and which of them it may withhold: bool [count]."""
+    chosen, none = withheld(count, settings.validation_share, np.random.default_rng([seed, 3])), np.zeros(count, bool)
+    if clock is not None:
+        return TimedSchedule(settings.iterations, clock), none
+    fixed = FixedSchedule(settings.iterations, settings.anneal, settings.begun, settings.handed_on)
+    if settings.validation_share == 0 or settings.handed_on:
+        return fixed, chosen if settings.handed_on else none
+    adaptive: AdaptiveSchedule | EarningSchedule = (
+        EarningSchedule(settings.iterations, _LOOK_EVERY, settings.price, _BEFORE, _FALL, settings.begun)
+        if settings.price > 0
+        else AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
+    )
+    if not adaptive.may_stop:
+        return adaptive, none
+    return (adaptive, chosen) if chosen.any() else (fixed, none)
+
+
 def fit_appearance(
     appearance: Appearance,
     track: Track,
@@ -279,21 +301,7 @@ def fit_appearance(
     rng = np.random.default_rng([seed, 1])
     size = look.features.shape[1] + look.log_scales.shape[1]
     measured = Sensitivities(track.carriers.count, size, device) if settings.measured_share > 0 else None
-    withheld_targets = np.zeros(len(targets), dtype=bool)
-    schedule: Schedule = FixedSchedule(settings.iterations, settings.anneal, settings.begun)
-    if clock is not None:
-        schedule = TimedSchedule(settings.iterations, clock)
-    elif settings.validation_share > 0:
-        adaptive: AdaptiveSchedule | EarningSchedule = (
-            EarningSchedule(settings.iterations, _LOOK_EVERY, settings.price, _BEFORE, _FALL)
-            if settings.price > 0
-            else AdaptiveSchedule(settings.iterations, _LOOK_EVERY, settings.stop_gain, _FALL)
-        )
-        if adaptive.may_stop:
-            withheld_targets = withheld(len(targets), settings.validation_share, np.random.default_rng([seed, 3]))
-        if withheld_targets.any() or not adaptive.may_stop:
-            schedule = adaptive
-
+    schedule, withheld_targets = _schedule(settings, len(targets), clock, seed)
     shown_heads = None if offer is None else ShownHeads(decoder)
     averages: Averages | None = None
     if isinstance(schedule, EarningSchedule) and schedule.withholds:
@@ -350,6 +358,10 @@ def fit_appearance(
         whole = replace((target.coarse or target).to(device), modes=None)
         feature_rows, scale_rows = learned(target.frame, active)
         children, _ = decoder.decode(feature_rows, scale_rows, None, active.state, whole.eye)
+        if device == CPU:
+            before = None if glass is None else glass.glass.seen(target.eye)
+            found = shares(children, whole.camera, whole.frozen, whole.wall, active.in_front, before)
+            return least(found, settings.idle_share)
 
         def drawn(colors: Tensor) -> Tensor:
             return shown(replace(children, colors=colors), whole, active)[0]
@@ -480,6 +492,7 @@ def fit_appearance(
         drawn,
         len(targets),
         tuple(schedule.earned) if isinstance(schedule, EarningSchedule) else (),
+        settings.begun,
     )
 
 

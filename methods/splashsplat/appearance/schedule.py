@@ -56,15 +56,13 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class FixedSchedule:
-    """`iterations`, at constant rates or down a half cosine, of which another fit made the first `begun`."""
+    """`iterations`, at constant rates or down a half cosine, of which another fit made the first `begun`. withholds:
+    for a fit that goes on from this one and looks at what neither has seen."""
 
     iterations: int
     anneal: bool
     begun: int = 0
-
-    @property
-    def withholds(self) -> bool:
-        return False
+    withholds: bool = False
 
     def due(self, iteration: int) -> bool:
         return False
@@ -105,18 +103,20 @@ class EarningSchedule:
     price: dB for each doubling of the time. before: iterations that would take as long as all that comes before the
     first. every: iterations between two looks at the withheld photographs; `_LOOKS` of them are averaged, and compared
     with as many before. Time is counted in iterations, so that the same fit ends at the same iteration on any machine.
+    begun: of them, the first ones, that another fit made. What is asked counts from there, `earned` from the first one.
     """
 
-    def __init__(self, limit: int, every: int, price: float, before: int, fall: float) -> None:
+    def __init__(self, limit: int, every: int, price: float, before: int, fall: float, begun: int = 0) -> None:
         self.limit, self.every, self.price, self.before, self.fall = limit, every, price, before, fall
+        self.begun = begun
         self.earned: list[Earned] = []
         self._looks: list[np.ndarray] = []
         # Where the fall begins, if it does; the last moment at which it would save anything.
         self._turn: int | None = None
         self._latest = round(limit / (1 + fall))
-        self._now = 0
+        self._now = begun
         #: whether looks can end the fit before the limit does
-        self.may_stop = 2 * _LOOKS * every < self._latest
+        self.may_stop = begun + 2 * _LOOKS * every < self._latest
 
     @property
     def withholds(self) -> bool:
@@ -126,6 +126,7 @@ class EarningSchedule:
         return self.withholds and iteration > 0 and iteration % self.every == 0
 
     def look(self, iteration: int, seen: WithheldLook) -> None:
+        iteration += self.begun
         self._looks.append(seen.psnr)
         if len(self._looks) < 2 * _LOOKS:
             return
@@ -140,6 +141,7 @@ class EarningSchedule:
             self._turn = iteration
 
     def factor(self, iteration: int) -> float | None:
+        iteration += self.begun
         self._now = iteration
         if iteration >= self._end:
             return None
@@ -149,7 +151,7 @@ class EarningSchedule:
         return LOWEST + left * (_cosine(self._turn / self.limit) - LOWEST) / (1 - LOWEST)
 
     def done(self, iteration: int) -> float:
-        return iteration / self._end
+        return (self.begun + iteration) / self._end
 
     @property
     def _end(self) -> int:
@@ -236,9 +238,9 @@ class AdaptiveSchedule:
 
 def withheld(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
     """Which of `count` photographs are withheld, bool [count]: `share` of them, at least 8; none where that would be
-    more than a tenth."""
+    more than a tenth, or `share` is 0."""
     chosen = np.zeros(count, dtype=bool)
     number = max(8, round(share * count))
-    if number <= count / 10:
+    if share > 0 and number <= count / 10:
         chosen[rng.choice(count, number, replace=False)] = True
     return chosen

@@ -20,6 +20,7 @@ from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 from ..motion.steps import Motion
 from .population import Carriers
+from .precision import HIGHEST, Precision
 
 # Times nearer to a frame than this fraction of the step are that frame: JSON and the harness round seconds.
 _SAME_FRAME = 1e-4
@@ -67,12 +68,14 @@ class CarrierState:
 
 @dataclass(frozen=True)
 class Track:
-    """Carriers and what moves them. phi: int8 [T, nx, ny, nz] on `grid`, see `pack_signed_distance`."""
+    """Carriers and what moves them. phi: int8 [T, nx, ny, nz] on `grid`, see `pack_signed_distance`. precision: that
+    in which they are stored."""
 
     grid: Grid
     carriers: Carriers
     motion: Motion
     phi: np.ndarray
+    precision: Precision = HIGHEST
 
     def ids(self, t: int) -> Tensor:
         """Numbers of the carriers of frame `t`, int64 [n]."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,6 @@ from .repeats import repeated_frames
 from .rim import Rim, rim_of
 
 Report = Callable[[float, str], None]
-
-# Edge of a hull voxel, as a share of the smallest length that the cameras can show: two samples of it and a little.
-_SHARE_OF_OBSERVABLE = 0.45
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
 _REVISION = 12
@@ -67,6 +64,7 @@ class FieldSettings:
     tight_bounds: bool = True
     repeats: bool = True
     observable: bool = False
+    observable_share: float = 0.45
 
     def key(self) -> dict[str, Any]:
         """What a stored phi_t was computed with; it is on the hull grid, whatever the transport grid."""
@@ -82,7 +80,8 @@ class Observations:
     silhouettes: the masks; those that failed are distrusted. hull_grid, grid: the fine grid of phi_t, and the coarser
     one of transport, with one origin. container: what carving knows of it, or None. occlusion: what it hides from
     cameras, or None. container_depths: per view its depth image, None where it hides nothing. cues: jet and pool, or
-    None where gravity is not known. repeated: bool [T], frames that show nothing new.
+    None where gravity is not known. repeated: bool [T], frames that show nothing new. pixel: what one spans at the
+    liquid, scene units, in the median of the views; None where none of them looks there.
     """
 
     settings: FieldSettings
@@ -94,6 +93,7 @@ class Observations:
     container_depths: list[np.ndarray | None]
     cues: GravityCues | None
     repeated: np.ndarray
+    pixel: float | None
 
     @property
     def n_frames(self) -> int:
@@ -108,6 +108,11 @@ class Observations:
     def ratio(self) -> float:
         """Hull voxels per transport voxel."""
         return self.grid.voxel / self.hull_grid.voxel
+
+    @property
+    def voxel_pixels(self) -> float | None:
+        """Pixels that a transport voxel spans at the liquid; None where no view looks there."""
+        return None if self.pixel is None else self.grid.voxel / self.pixel
 
     def signed_distances(self, run: Run) -> Iterator[np.ndarray]:
         """phi_t of one frame after another: float16 on `hull_grid`, in its voxels.
@@ -167,13 +172,19 @@ def _standing(scene: TrainingScene) -> Standing:
 
 @dataclass(frozen=True)
 class Sighting:
-    """What the masks say whatever the grids. silhouettes, container: see `Observations`. rim: of the container, where
-    it was looked for. bounds: the padded box around all liquid."""
+    """What the masks of `scene` say whatever the grids. silhouettes, container: see `Observations`. rim: of the
+    container, where it was looked for. bounds: the padded box around all liquid."""
 
+    scene: TrainingScene
     silhouettes: Silhouettes
     container: ContainerOcclusion | None
     rim: Rim | None
     bounds: Bounds
+
+    @cached_property
+    def observable(self) -> Observable:
+        """The smallest length that the cameras can show."""
+        return observable(self.scene, self.silhouettes, self.bounds, self.container)
 
 
 #: Sightings of one scene with one known container, by what they depend on: for those who trace it on several grids.
@@ -212,11 +223,12 @@ def observe(
     voxel_pixels = settings.clear_voxel_pixels if seen_through else settings.voxel_pixels
     if settings.observable:
         with run.stage("observable length"):
-            found = observable(scene, silhouettes, bounds, container)
-        wanted = max(_SHARE_OF_OBSERVABLE * found.pixels, settings.voxel_pixels, 1e-3)
-        run.decide(_grid_decision(found, wanted, scene.metres_per_unit))
+            found = sighting.observable
+        wanted = max(settings.observable_share * found.pixels, settings.voxel_pixels, 1e-3)
+        run.decide(_grid_decision(found, settings.observable_share, wanted, scene.metres_per_unit))
         voxel_pixels = wanted
-    hull_cells, transport_cells = _cells(bounds, scene, settings, voxel_pixels)
+    pixel = _pixel(bounds, scene)
+    hull_cells, transport_cells = _cells(bounds, pixel, settings, voxel_pixels)
     run.note("grid", f"{hull_cells} cells along the longest side of {bounds.longest_side:.3g}")
     hull_grid, grid = Grid.over(bounds, hull_cells), Grid.over(bounds, transport_cells)
     occlusion = None
@@ -245,7 +257,7 @@ def observe(
         run.note(
             "repeated frames", f"{int(repeated.sum())} of {len(repeated)} timesteps show what the one before shows"
         )
-    return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues, repeated)
+    return Observations(settings, silhouettes, hull_grid, grid, container, occlusion, depths, cues, repeated, pixel)
 
 
 def _sighting(
@@ -279,11 +291,11 @@ def _sighting(
             rim = rim_of(known, scene, silhouettes.failed_masks)
         container = container.with_mesh(rim.mesh)
     bounds = _bounds(scene, silhouettes, container, settings, run, report)
-    found = before[key] = Sighting(silhouettes, container, rim, bounds)
+    found = before[key] = Sighting(scene, silhouettes, container, rim, bounds)
     return found
 
 
-def _grid_decision(found: Observable, wanted: float, metres: float | None) -> Decision:
+def _grid_decision(found: Observable, share: float, wanted: float, metres: float | None) -> Decision:
     """What the smallest length that the cameras can show is made of, and the hull's voxels that follow from it."""
 
     def length(pixels: float) -> str:
@@ -302,7 +314,7 @@ def _grid_decision(found: Observable, wanted: float, metres: float | None) -> De
         name="hull voxel",
         basis="scene",
         chosen=length(wanted),
-        because=f"{_SHARE_OF_OBSERVABLE:g} of the smallest length that the cameras can show, or voxel_pixels if larger",
+        because=f"{share:g} of the smallest length that the cameras can show, or voxel_pixels if larger",
         rungs=[
             Rung(value=f"{name}: {pixels:.2f} px", bought=True, reason=reason)
             for name, (pixels, reason) in terms.items()
@@ -310,20 +322,22 @@ def _grid_decision(found: Observable, wanted: float, metres: float | None) -> De
     )
 
 
-def _cells(bounds: Bounds, scene: TrainingScene, settings: FieldSettings, voxel_pixels: float) -> tuple[int, int]:
-    """Cells of the hull grid and of the transport grid along the longest side, as the photographs need them."""
-    most = settings.hull_cells, settings.transport_cells
-    if voxel_pixels == 0:
-        return most
+def _pixel(bounds: Bounds, scene: TrainingScene) -> float | None:
+    """What a pixel spans in the middle of the bounds, scene units, in the median of the views before which they lie."""
     middle = (bounds.low + bounds.high) / 2
-    pixels = []
+    spans = []
     for camera in (scene.cameras[name] for name in scene.train):
         depth = float((camera.w2c[2, :3] @ middle) + camera.w2c[2, 3])
         if depth > 0:
-            pixels.append(depth / focal_length(camera))
-    if not pixels:
-        return most
-    needed = bounds.longest_side / (voxel_pixels * float(np.median(pixels)))
+            spans.append(depth / focal_length(camera))
+    return float(np.median(spans)) if spans else None
+
+
+def _cells(bounds: Bounds, pixel: float | None, settings: FieldSettings, voxel_pixels: float) -> tuple[int, int]:
+    """Cells of the hull grid and of the transport grid along the longest side, as the photographs need them."""
+    if voxel_pixels == 0 or pixel is None:
+        return settings.hull_cells, settings.transport_cells
+    needed = bounds.longest_side / (voxel_pixels * pixel)
     share = min(1.0, max(needed, min(settings.fewest_cells, settings.hull_cells)) / settings.hull_cells)
     # The transport grid first, so that its voxels stay the same number of the hull's.
     transport = max(2, round(share * settings.transport_cells))

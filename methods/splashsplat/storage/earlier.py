@@ -1,4 +1,5 @@
-"""Models of earlier versions: half-precision tables in four archives, formats 3 and 4 (with glass)."""
+"""Models of earlier versions: half-precision tables in four archives, formats 3 and 4 (with glass); and format 5, which
+has the coefficients of all carriers in one array."""
 
 from __future__ import annotations
 
@@ -21,9 +22,29 @@ from ..motion.fall import falls_of
 from ..motion.steps import Motion
 from ..motion.velocity import Factor
 from .looks import GLASS_RANKS
+from .values import LEVELS, StoredValues
 
 #: Formats that are read here; the second one has glass.
 EARLIER = (3, 4)
+#: The format whose coefficients `sorted_by_coarseness` sorts.
+UNSORTED = 5
+#: Of its appearance, beside what the heads and glass have.
+UNSORTED_VALUES: Mapping[str, int] = {"center": 1, "basis": 2, "coarseness": 1, "coefficients": 2}
+# Its least coarseness: later formats count from 0.
+_LEAST = -2
+
+
+def sorted_by_coarseness(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The appearance of format `UNSORTED` as later ones have it. Raises ValueError where it does not fit together."""
+    others = {name: array for name, array in arrays.items() if name not in UNSORTED_VALUES}
+    coarseness = arrays["coarseness"].astype(np.int64) - _LEAST
+    if len(coarseness) and not 0 <= coarseness.min() <= coarseness.max() < LEVELS:
+        raise ValueError(f"coarseness is not between {_LEAST} and {_LEAST + LEVELS - 1}")
+    if arrays["coefficients"].shape[1] != len(coarseness):
+        raise ValueError(f"{arrays['coefficients'].shape[1]} coefficients do not fit {len(coarseness)} carriers")
+    parts = tuple(arrays["coefficients"][:, coarseness == level] for level in range(LEVELS))
+    basis = arrays["basis"] * np.float32(2.0**_LEAST)
+    return others | StoredValues(arrays["center"], basis, coarseness.astype(np.uint8), parts).arrays
 
 
 def read_earlier(

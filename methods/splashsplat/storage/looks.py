@@ -13,8 +13,7 @@ from ..appearance.decoder import Decoder
 from ..appearance.fitting import Appearance
 from ..appearance.glass import Glass
 from ..appearance.sensitivity import Sensitivity
-from .rows import POSITION_STEPS
-from .values import StoredValues, read_values, store_values
+from .values import COEFFICIENTS, LEVELS, StoredValues, read_values, store_values
 
 #: Tables of glass, each with its number of dimensions.
 GLASS_RANKS: Mapping[str, int] = {
@@ -25,17 +24,21 @@ GLASS_RANKS: Mapping[str, int] = {
     "colors": 2,
     "slopes": 3,
 }
-_VALUES: Mapping[str, int] = {"center": 1, "basis": 2, "coarseness": 1, "coefficients": 2}
+_COEFFICIENTS = {f"{COEFFICIENTS}{level}": 2 for level in range(LEVELS)}
+#: Arrays of the values of carriers, each with its number of dimensions.
+VALUES: Mapping[str, int] = {"center": 1, "basis": 2, "coarseness": 1, **_COEFFICIENTS}
 _HEADS, _GLASS = "heads.", "glass."
 # Log-scales are the last ones of a carrier's values.
 _SCALES = 3
+# Of glass, positions are in such parts of a transport voxel.
+_GLASS_STEPS = 32
 
 
-def appearance_ranks(decoder: Decoder, with_glass: bool) -> dict[str, int]:
-    """Dimensions of all arrays of the file."""
+def appearance_ranks(decoder: Decoder, with_glass: bool, values: Mapping[str, int] = VALUES) -> dict[str, int]:
+    """Dimensions of all arrays of the file. values: of those of carriers."""
     heads = {f"{_HEADS}{name}": value.ndim for name, value in decoder.state_dict().items()}
     glass = {f"{_GLASS}{name}": rank for name, rank in GLASS_RANKS.items()} if with_glass else {}
-    return {**_VALUES, **heads, **glass}
+    return {**values, **heads, **glass}
 
 
 def learned_values(appearance: Appearance) -> np.ndarray:
@@ -56,8 +59,8 @@ def appearance_arrays(
     if appearance.glass is not None:
         glass = {f"{_GLASS}{name}": table.half().numpy() for name, table in appearance.glass.tables.items()}
         places = (appearance.glass.positions.numpy() - grid.origin) / grid.voxel
-        glass[f"{_GLASS}positions"] = np.rint(places * POSITION_STEPS).astype(np.int32)
-    return {**vars(stored), **heads, **glass}
+        glass[f"{_GLASS}positions"] = np.rint(places * _GLASS_STEPS).astype(np.int32)
+    return {**stored.arrays, **heads, **glass}
 
 
 def read_appearance(arrays: Mapping[str, np.ndarray], decoder: Decoder, grid: Grid) -> Appearance:
@@ -65,15 +68,15 @@ def read_appearance(arrays: Mapping[str, np.ndarray], decoder: Decoder, grid: Gr
 
     Raises ValueError or RuntimeError where it does not fit together.
     """
-    stored = StoredValues(**{name: arrays[name] for name in _VALUES})
-    if len(stored.coefficients) != decoder.settings.feature_size + _SCALES:
-        size = len(stored.coefficients)
+    stored = StoredValues.of(arrays)
+    size = len(stored.center)
+    if size != decoder.settings.feature_size + _SCALES:
         raise ValueError(f"{size} values of a carrier are not {decoder.settings.feature_size} + {_SCALES}")
     values = read_values(stored)
     decoder.load_state_dict({name: torch.from_numpy(arrays[f"{_HEADS}{name}"]) for name in decoder.state_dict()})
     glass = None
     if f"{_GLASS}positions" in arrays:
         tables = {name: arrays[f"{_GLASS}{name}"] for name in GLASS_RANKS}
-        glass = Glass.of_tables(tables | {"positions": grid.to_scene(tables["positions"] / POSITION_STEPS)})
+        glass = Glass.of_tables(tables | {"positions": grid.to_scene(tables["positions"] / _GLASS_STEPS)})
     features, scales = (torch.from_numpy(part.copy()) for part in np.split(values, [-_SCALES], axis=1))
     return Appearance(features, scales, decoder, glass)

@@ -3,6 +3,10 @@
 A carrier's place in a frame is predicted from its place in the frame before by the fitted velocity; only the difference
 is stored. F is not stored: it is the identity at birth, and the stored motion deforms it. Nor is phi at a carrier. The
 prediction is made of single IEEE operations in double precision, so that every machine finds the same whole numbers.
+
+How long a step is, the photographs decide: a sixteenth of a voxel where a voxel is about a pixel. Where the motion
+misses a carrier by less than photographs can show, nothing is stored, and it is where the motion leads. The next
+difference is to that place, so that misses do not add up.
 """
 
 from __future__ import annotations
@@ -19,13 +23,12 @@ from splashbench.parallel import over_range
 from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 from ..carriers.population import Carriers, taken
+from ..carriers.precision import Precision
 from ..motion.steps import Motion
 from ..motion.velocity import factors
 
-#: Whole steps per transport voxel, in which positions are stored. A voxel is about a pixel (`voxel_pixels`).
-POSITION_STEPS = 32
-#: The same for velocities, which are at most 8 voxels a frame (`velocity_limit`), and those of 16 bits.
-VELOCITY_STEPS, MAX_VELOCITY = 64, 32767
+#: Of velocities, in whole steps: those of 16 bits. They are at most 8 voxels a frame (`velocity_limit`).
+MAX_VELOCITY = 32767
 #: Carriers of all frames together: a few kilobytes of zeros could ask for more than there is memory.
 MAX_ROWS = 1 << 26
 _SMALL_LOOP = 1024
@@ -45,17 +48,18 @@ class StoredRows:
     residuals: NDArray[np.signedinteger]
 
 
-def whole_velocities(velocities: np.ndarray) -> NDArray[np.int16]:
+def whole_velocities(velocities: np.ndarray, precision: Precision) -> NDArray[np.int16]:
     """Voxels per frame in whole steps."""
-    steps = np.clip(np.rint(velocities.astype(np.float64) * VELOCITY_STEPS), -MAX_VELOCITY, MAX_VELOCITY)
+    whole = np.rint(velocities.astype(np.float64) * precision.velocity_steps)
+    steps = np.clip(whole, -MAX_VELOCITY, MAX_VELOCITY)
     return steps.astype(np.int16)
 
 
-def stored_order(carriers: Carriers, shape: tuple[int, int, int]) -> Carriers:
+def stored_order(carriers: Carriers, shape: tuple[int, int, int], steps: int) -> Carriers:
     """The same carriers, numbered by the frame of their birth and there by cell: neighbours in space are neighbours
-    in the files."""
+    in the files. steps: of `Precision`."""
     births, _ = carriers.births_and_ends()
-    cells = _cell_numbers(_steps_of(carriers.positions[_first_rows(carriers)], shape)[0], shape)
+    cells = _cell_numbers(_steps_of(carriers.positions[_first_rows(carriers)], shape, steps)[0], shape)
     order = np.lexsort((cells, births))
     new = np.empty(carriers.count, dtype=np.int32)
     new[order] = np.arange(carriers.count, dtype=np.int32)
@@ -72,23 +76,28 @@ def stored_order(carriers: Carriers, shape: tuple[int, int, int]) -> Carriers:
     )
 
 
-def store_rows(carriers: Carriers, control: NDArray[np.int16], motion: Motion, grid: Grid) -> StoredRows:
+def store_rows(
+    carriers: Carriers, control: NDArray[np.int16], motion: Motion, grid: Grid, precision: Precision
+) -> StoredRows:
     """Carriers in whole numbers; control: `whole_velocities` of the motion. Raises ValueError where a carrier's life
     has a gap, or carriers are not numbered by the frame of their birth."""
     births, ends = carriers.births_and_ends()
     lives = ends.astype(np.int64) - births + 1
     if (np.diff(births) < 0).any() or (lives < 1).any() or lives.sum() != len(carriers.ids):
         raise ValueError("carriers must be numbered by the frame of their birth and last without a gap")
-    cells, within = _steps_of(carriers.positions[_first_rows(carriers)], grid.shape)
+    cells, within = _steps_of(carriers.positions[_first_rows(carriers)], grid.shape, precision.steps)
     residuals = []
-    steps = _whole(carriers.positions[carriers.rows(0)], grid.shape)
+    steps = _whole(carriers.positions[carriers.rows(0)], grid.shape, precision.steps)
     for t in range(1, carriers.n_frames):
         before, now = carriers.rows(t - 1), carriers.rows(t)
         stays = births[carriers.ids[now]] < t
         places = np.searchsorted(carriers.ids[before], carriers.ids[now][stays])
-        predicted = _predicted(steps[places], control[t - 1], motion)
-        steps = _whole(carriers.positions[now], grid.shape)
-        residuals.append((steps[stays] - predicted).astype(np.int32))
+        predicted = _predicted(steps[places], control[t - 1], motion, precision.steps)
+        steps = _whole(carriers.positions[now], grid.shape, precision.steps)
+        missed = steps[stays] - predicted
+        missed[np.abs(missed) <= precision.spared] = 0
+        steps[stays] = _clipped(predicted + missed, grid.shape, precision.steps)
+        residuals.append(missed.astype(np.int32))
     joined = np.concatenate(residuals) if residuals else np.zeros((0, 3), np.int32)
     kind = np.min_scalar_type(-int(np.abs(joined).max(initial=0)) - 1)
     return StoredRows(
@@ -100,8 +109,11 @@ def store_rows(carriers: Carriers, control: NDArray[np.int16], motion: Motion, g
     )
 
 
-def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, phi: np.ndarray, grid: Grid) -> Carriers:
-    """The carriers that `store_rows` was given. control, motion: as there; phi: int8 [T, nx, ny, nz], packed.
+def read_rows(
+    stored: StoredRows, control: NDArray[np.int16], motion: Motion, phi: np.ndarray, grid: Grid, steps: int
+) -> Carriers:
+    """The carriers that `store_rows` was given, to within its precision. control, motion: as there; phi: int8
+    [T, nx, ny, nz], packed; steps: of `Precision`.
 
     Raises ValueError where the numbers do not fit together.
     """
@@ -110,6 +122,8 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
         raise ValueError("births, lives and cells are of different numbers of carriers")
     if stored.within.shape != (count, 3) or stored.residuals.ndim != 2 or stored.residuals.shape[1] != 3:
         raise ValueError("positions are not of three coordinates each")
+    if count and stored.within.max() >= steps:
+        raise ValueError(f"a place in a cell is beyond its {steps} steps")
     births = np.repeat(np.arange(n_frames), stored.births)
     lives = stored.lives.astype(np.int64)
     ends = births + lives
@@ -122,11 +136,11 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
     cells = np.cumsum(stored.cells.astype(np.int64))
     if count and (cells.min() < 0 or cells.max() >= np.prod(grid.shape, dtype=np.int64)):
         raise ValueError("a carrier is born outside the grid")
-    born = np.stack(np.unravel_index(cells, grid.shape), axis=1) * POSITION_STEPS + stored.within
+    born = np.stack(np.unravel_index(cells, grid.shape), axis=1) * steps + stored.within
     identity = np.eye(3, dtype=np.float32)
     firsts = np.concatenate([[0], np.cumsum(stored.births, dtype=np.int64)])
     ids = np.zeros(0, dtype=np.int32)
-    steps, deformation = np.zeros((0, 3), np.int64), np.zeros((0, 3, 3), np.float32)
+    places, deformation = np.zeros((0, 3), np.int64), np.zeros((0, 3, 3), np.float32)
     # Filled frame by frame: parts that are joined would be in memory twice.
     total, row, at = int(lives.sum()), 0, 0
     read = Carriers(
@@ -140,17 +154,17 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
     for t in range(n_frames):
         if len(ids):
             stays = ends[ids] > t
-            _, deformed = motion.step(t - 1).forecast(_voxels(steps), deformation)
-            ids, steps, deformation = ids[stays], steps[stays], deformed[stays]
+            _, deformed = motion.step(t - 1).forecast(_voxels(places, steps), deformation)
+            ids, places, deformation = ids[stays], places[stays], deformed[stays]
             moves = stored.residuals[at : at + len(ids)]
             at += len(ids)
-            steps = _clipped(_predicted(steps, control[t - 1], motion) + moves, grid.shape)
+            places = _clipped(_predicted(places, control[t - 1], motion, steps) + moves, grid.shape, steps)
         new = slice(int(firsts[t]), int(firsts[t + 1]))
         ids = np.concatenate([ids, np.arange(new.start, new.stop, dtype=np.int32)])
-        steps = np.concatenate([steps, born[new]])
+        places = np.concatenate([places, born[new]])
         deformation = np.concatenate([deformation, np.broadcast_to(identity, (new.stop - new.start, 3, 3))])
         rows = slice(row, row + len(ids))
-        positions = _voxels(steps)
+        positions = _voxels(places, steps)
         read.ids[rows], read.positions[rows], read.deformation[rows] = ids, positions, deformation
         read.phi[rows] = sample(phi[t], positions) / np.float32(STEPS_PER_VOXEL)
         row = rows.stop
@@ -158,8 +172,8 @@ def read_rows(stored: StoredRows, control: NDArray[np.int16], motion: Motion, ph
     return read
 
 
-def _voxels(steps: np.ndarray) -> np.ndarray:
-    return (steps / POSITION_STEPS).astype(np.float32)
+def _voxels(places: np.ndarray, steps: int) -> np.ndarray:
+    return (places / steps).astype(np.float32)
 
 
 def _first_rows(carriers: Carriers) -> np.ndarray:
@@ -169,42 +183,42 @@ def _first_rows(carriers: Carriers) -> np.ndarray:
     return rows
 
 
-def _clipped(steps: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    return np.clip(steps, 0, np.array(shape) * POSITION_STEPS - 1).astype(np.int64)
+def _clipped(places: np.ndarray, shape: tuple[int, int, int], steps: int) -> np.ndarray:
+    return np.clip(places, 0, np.array(shape) * steps - 1).astype(np.int64)
 
 
-def _steps_of(positions: np.ndarray, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _steps_of(positions: np.ndarray, shape: tuple[int, int, int], steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Cells [n, 3], and places in them in steps."""
-    steps = _whole(positions, shape)
-    return steps // POSITION_STEPS, steps % POSITION_STEPS
+    places = _whole(positions, shape, steps)
+    return places // steps, places % steps
 
 
-def _whole(positions: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+def _whole(positions: np.ndarray, shape: tuple[int, int, int], steps: int) -> np.ndarray:
     """Places in whole steps, int64 [n, 3]."""
-    return _clipped(np.rint(positions.astype(np.float64) * POSITION_STEPS), shape)
+    return _clipped(np.rint(positions.astype(np.float64) * steps), shape, steps)
 
 
 def _cell_numbers(cells: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     return (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
 
 
-def _predicted(steps: np.ndarray, control: NDArray[np.int16], motion: Motion) -> np.ndarray:
-    """Where the motion leads from `steps` [n, 3] in one frame, int64 [n, 3]: by the velocity there."""
-    moved = np.empty(steps.shape, np.int64)
+def _predicted(places: np.ndarray, control: NDArray[np.int16], motion: Motion, steps: int) -> np.ndarray:
+    """Where the motion leads from `places` [n, 3] in one frame, int64 [n, 3], in steps: by the velocity there."""
+    moved = np.empty(places.shape, np.int64)
     wide = np.array(factors(motion.factor), dtype=np.float64)
-    over_range(_predict, len(steps), steps, np.ascontiguousarray(control), wide, moved, smallest=_SMALL_LOOP)
+    over_range(_predict, len(places), places, np.ascontiguousarray(control), wide, steps, moved, smallest=_SMALL_LOOP)
     return moved
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _predict(
-    steps: np.ndarray, control: np.ndarray, wide: np.ndarray, moved: np.ndarray, start: int, stop: int
+    places: np.ndarray, control: np.ndarray, wide: np.ndarray, steps: int, moved: np.ndarray, start: int, stop: int
 ) -> None:
     # What is stored depends on the rounding of every line: the file format has them as they stand here.
     low, share = np.empty(3, np.int64), np.empty(3)
     for n in range(start, stop):
         for axis in range(3):
-            place = (steps[n, axis] / POSITION_STEPS - 0.5 * (wide[axis] - 1)) / wide[axis]
+            place = (places[n, axis] / steps - 0.5 * (wide[axis] - 1)) / wide[axis]
             place = min(max(place, 0.0), control.shape[axis] - 1.0)
             low[axis] = min(int(np.floor(place)), control.shape[axis] - 2)
             share[axis] = place - low[axis]
@@ -217,4 +231,4 @@ def _predict(
                     for c in range(2):
                         weight = x * y * (share[2] if c else 1 - share[2])
                         total = total + weight * control[low[0] + a, low[1] + b, low[2] + c, axis]
-            moved[n, axis] = steps[n, axis] + int(np.rint(total * (POSITION_STEPS / VELOCITY_STEPS)))
+            moved[n, axis] = places[n, axis] + int(np.rint(total * 0.5))  # velocities in half a step

@@ -153,7 +153,7 @@ class Storage:
         return store_values(self._learned(rows), self._known.kept(rows), stored.step)
 
     def _value_bytes(self, stored: Stored) -> int:
-        return compressed_bytes(vars(self._coded(stored)))
+        return compressed_bytes(self._coded(stored).arrays)
 
     def _trial(self, stored: Stored) -> Trial:
         read = torch.from_numpy(read_values(self._coded(stored)))

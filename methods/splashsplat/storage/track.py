@@ -11,11 +11,12 @@ from splashbench.native import memory
 from splashbench.observe.grid import Grid
 
 from ..carriers.population import Carriers
+from ..carriers.precision import Precision
 from ..carriers.subframe import Track
 from ..motion.fall import falls_of, table_of
 from ..motion.steps import Motion
 from ..motion.velocity import Factor
-from .rows import VELOCITY_STEPS, StoredRows, read_rows, store_rows, stored_order, whole_velocities
+from .rows import StoredRows, read_rows, store_rows, stored_order, whole_velocities
 from .signed_distance import coarse_distance, read_distance, store_distance
 
 #: Arrays of the files of a track, each with its number of dimensions; `deformation` is optional.
@@ -25,30 +26,32 @@ MOTION: Mapping[str, int] = {"velocities": 5, "jets": 2, "turn": 2}
 DISTANCE: Mapping[str, int] = {"phi": 4}
 
 
-def stored_track(track: Track, times: np.ndarray, carried: bool, distance_steps: int) -> Track:
+def stored_track(track: Track, times: np.ndarray, carried: bool, distance_steps: int, precision: Precision) -> Track:
     """`track` in the precision in which it is stored, its carriers numbered anew.
 
     times: [T] of the frames, seconds. carried: whether the motion is what moved the carriers; else their F is stored.
-    distance_steps: of phi to either side, see `reach`.
+    distance_steps: of phi to either side, see `reach`. precision: of places and velocities.
     """
     coarse = replace(
         track,
-        carriers=stored_order(track.carriers, track.grid.shape),
+        carriers=stored_order(track.carriers, track.grid.shape, precision.steps),
         phi=coarse_distance(track.phi, distance_steps),
+        precision=precision,
     )
-    rows, moves = carrier_arrays(coarse, coarse.carriers, carried), motion_arrays(track.motion)
+    rows, moves = carrier_arrays(coarse, coarse.carriers, carried), motion_arrays(coarse)
     phi = coarse.phi
     del coarse
     memory.give_back()
-    motion = _read_motion(moves, track.grid, times, track.motion.factor)
-    return Track(track.grid, _read_carriers(rows, moves, motion, phi, track.grid), motion, phi)
+    motion = _read_motion(moves, track.grid, times, track.motion.factor, precision)
+    carriers = _read_carriers(rows, moves, motion, phi, track.grid, precision)
+    return Track(track.grid, carriers, motion, phi, precision)
 
 
 def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]]:
     """What is stored of a track, by file. Of one that `stored_track` gave, this loses nothing."""
     return {
         "carriers": carrier_arrays(track, track.carriers, carried),
-        "motion": motion_arrays(track.motion),
+        "motion": motion_arrays(track),
         "distance": distance_arrays(track.phi),
     }
 
@@ -58,22 +61,24 @@ def distance_arrays(phi: np.ndarray) -> dict[str, np.ndarray]:
     return {"phi": store_distance(phi)}
 
 
-def motion_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """What is stored of a motion."""
-    jets, turn = table_of(motion.falls)
-    return {"velocities": whole_velocities(motion.velocities), "jets": jets, "turn": turn}
+def motion_arrays(track: Track) -> dict[str, np.ndarray]:
+    """What is stored of the motion of `track`."""
+    jets, turn = table_of(track.motion.falls)
+    return {"velocities": whole_velocities(track.motion.velocities, track.precision), "jets": jets, "turn": turn}
 
 
 def carrier_arrays(track: Track, carriers: Carriers, carried: bool) -> dict[str, np.ndarray]:
     """What is stored of `carriers`, those of `track` or some of them."""
-    control = whole_velocities(track.motion.velocities)
-    rows = dict(vars(store_rows(carriers, control, track.motion, track.grid)))
+    control = whole_velocities(track.motion.velocities, track.precision)
+    rows = dict(vars(store_rows(carriers, control, track.motion, track.grid, track.precision)))
     if not carried:
         rows["deformation"] = carriers.deformation.astype(np.float16)
     return rows
 
 
-def read_track(arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times: np.ndarray, factor: Factor) -> Track:
+def read_track(
+    arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times: np.ndarray, factor: Factor, precision: Precision
+) -> Track:
     """The track of what `track_arrays` gave. Raises ValueError where it does not fit together."""
     n_frames = len(times)
     control = arrays["motion"]["velocities"]
@@ -82,21 +87,29 @@ def read_track(arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times
     stored = arrays["distance"]["phi"]
     if stored.dtype != np.int8 or stored.shape != (n_frames, *grid.shape):
         raise ValueError(f"phi is {stored.dtype} {stored.shape}, not int8 of {n_frames} frames on {grid.shape} nodes")
-    motion = _read_motion(arrays["motion"], grid, times, factor)
+    motion = _read_motion(arrays["motion"], grid, times, factor, precision)
     phi = read_distance(stored)
-    return Track(grid, _read_carriers(arrays["carriers"], arrays["motion"], motion, phi, grid), motion, phi)
+    carriers = _read_carriers(arrays["carriers"], arrays["motion"], motion, phi, grid, precision)
+    return Track(grid, carriers, motion, phi, precision)
 
 
-def _read_motion(arrays: Mapping[str, np.ndarray], grid: Grid, times: np.ndarray, factor: Factor) -> Motion:
+def _read_motion(
+    arrays: Mapping[str, np.ndarray], grid: Grid, times: np.ndarray, factor: Factor, precision: Precision
+) -> Motion:
     falls = falls_of(arrays["jets"], arrays["turn"], grid, times)
-    return Motion(arrays["velocities"].astype(np.float32) / np.float32(VELOCITY_STEPS), factor, falls)
+    return Motion(arrays["velocities"].astype(np.float32) / np.float32(precision.velocity_steps), factor, falls)
 
 
 def _read_carriers(
-    arrays: Mapping[str, np.ndarray], moves: Mapping[str, np.ndarray], motion: Motion, phi: np.ndarray, grid: Grid
+    arrays: Mapping[str, np.ndarray],
+    moves: Mapping[str, np.ndarray],
+    motion: Motion,
+    phi: np.ndarray,
+    grid: Grid,
+    precision: Precision,
 ) -> Carriers:
     rows = StoredRows(**{name: arrays[name] for name in CARRIERS})
-    carriers = read_rows(rows, moves["velocities"], motion, phi, grid)
+    carriers = read_rows(rows, moves["velocities"], motion, phi, grid, precision.steps)
     deformation = arrays.get("deformation")
     if deformation is not None:
         if deformation.shape != carriers.deformation.shape:

@@ -174,6 +174,28 @@ int splash_backward(SplashFrame* handle, const float* grad_color, const float* g
     }
 }
 
+int splash_weigh(const SplashCamera* camera, const SplashGaussians* gaussians, const float* counts, const SplashFrame* frozen,
+                 int32_t threads, float* weights) {
+    SplashFrame* handle = nullptr;
+    try {
+        handle = splash::take_frame();
+        splash::Frame& frame = handle->frame;
+        frame.compact = false;
+        frame.background = nullptr;
+        frame.background_per_pixel = false;
+        SplashGaussians shapes = *gaussians;
+        shapes.channels = 0;
+        const splash::Frame* const other = frozen == nullptr ? nullptr : &frozen->frame;
+        const int status = splash::prepare(frame, *camera, shapes, false, nullptr, other, threads);
+        if (status == SPLASH_DONE) splash::weigh(frame, counts, weights);
+        splash_release(handle);
+        return status;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        delete handle;
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
 void splash_release(SplashFrame* handle) {
     if (handle == nullptr) return;
     if (!handle->frame.frozen_itself && splash_frame_bytes(handle) <= splash::MAX_SPARE_BYTES) {

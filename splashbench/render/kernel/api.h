@@ -12,7 +12,7 @@ extern "C" {
 #endif
 
 // Raised with every change to what follows; the loader refuses another version.
-#define SPLASH_ABI_VERSION 3
+#define SPLASH_ABI_VERSION 4
 
 typedef struct SplashCamera {
     double world_to_camera[12];  // [3, 4]: rotation and translation, x right, y down, z forward
@@ -59,6 +59,11 @@ SPLASH_API int splash_freeze(const SplashCamera*, const SplashGaussians*, int32_
 // Gradients of a loss, given those by the outputs (in their layout; null: zero). May be called again.
 SPLASH_API int splash_backward(SplashFrame*, const float* grad_color, const float* grad_opacity, int32_t threads,
                                const SplashGradients*);
+
+// What each Gaussian makes up of an image: the sum over its pixels of the weight with which it is composited there.
+// counts: [H, W], how much each pixel counts; null: 1. weights: [N]. Colours are not read.
+SPLASH_API int splash_weigh(const SplashCamera*, const SplashGaussians*, const float* counts, const SplashFrame* frozen,
+                            int32_t threads, float* weights);
 
 // Gives a frame back; its memory serves the next call.
 SPLASH_API void splash_release(SplashFrame*);

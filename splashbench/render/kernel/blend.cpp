@@ -88,11 +88,12 @@ __attribute__((noinline)) void exhaust(Ints exhausted, int index, int vector, fl
 }
 
 // Adds one layer to the pixels it covers. CHANNELS: 0 opacity alone, -1 as many as `channels` says. CLAMPED: whether its
-// alpha can reach MAX_ALPHA.
-template <int CHANNELS, bool CLAMPED>
-inline void add_layer(const Layer& layer, int index, const Footprint& f, const float* columns, int channels, float* cells,
-                      int32_t* stops, Alive& alive) {
+// alpha can reach MAX_ALPHA. WEIGHED: returns the sum of its weights, each times its pixel's `counts`; else 0.
+template <int CHANNELS, bool CLAMPED, bool WEIGHED>
+inline float add_layer(const Layer& layer, int index, const Footprint& f, const float* columns, int channels, float* cells,
+                       int32_t* stops, Alive& alive, const float* counts) {
     if (CHANNELS >= 0) channels = CHANNELS;
+    Floats weights = all(0.0f);
     const Floats root = all(layer.splat->root);
     for (int row = f.top; row <= f.bottom; ++row) {
         const Floats shift = all(f.shift[row]), peak = all(f.peak[row]);
@@ -118,13 +119,16 @@ inline void add_layer(const Layer& layer, int index, const Footprint& f, const f
             for (int channel = 1; channel <= channels; ++channel) {
                 store(cell + channel * LANES, load(cell + channel * LANES) + weight * layer.color[channel - 1]);
             }
+            if (WEIGHED) weights += weight * load(counts + vector * LANES);
         }
     }
+    return WEIGHED ? sum(weights) : 0.0f;
 }
 
-// Composites `layers`, front to back; CHANNELS as above.
-template <int CHANNELS>
-void composite(const std::vector<Layer>& layers, const TileFrame& tile, int channels, float* cells, int32_t* stops) {
+// Composites `layers`, front to back; CHANNELS and WEIGHED as above. slots: where the sums of weights go, by slot.
+template <int CHANNELS, bool WEIGHED = false>
+void composite(const std::vector<Layer>& layers, const TileFrame& tile, int channels, float* cells, int32_t* stops,
+               const float* counts = nullptr, float* slots = nullptr) {
     if (CHANNELS >= 0) channels = CHANNELS;
     Alive alive;
     begin_tile(tile, channels, cells, stops, alive);
@@ -136,11 +140,11 @@ void composite(const std::vector<Layer>& layers, const TileFrame& tile, int chan
         if (index + AHEAD < count) prefetch(layers[index + AHEAD].splat);
         const Layer& layer = layers[index];
         find_footprint(*layer.splat, tile, f);
-        if (may_clamp(*layer.splat)) {
-            add_layer<CHANNELS, true>(layer, index, f, columns, channels, cells, stops, alive);
-        } else {
-            add_layer<CHANNELS, false>(layer, index, f, columns, channels, cells, stops, alive);
-        }
+        const float weight =
+            may_clamp(*layer.splat)
+                ? add_layer<CHANNELS, true, WEIGHED>(layer, index, f, columns, channels, cells, stops, alive, counts)
+                : add_layer<CHANNELS, false, WEIGHED>(layer, index, f, columns, channels, cells, stops, alive, counts);
+        if (WEIGHED && layer.slot >= 0) slots[layer.slot] = weight;
     }
     for (int vector = 0; vector < TILE_VECTORS; ++vector) {
         for (int lane = 0; lane < LANES; ++lane) {
@@ -296,6 +300,38 @@ void blend(Frame& frame, float* color, float* opacity) {
                 store(transmittance + vector * LANES, load(baked + vector * cell_size(frozen->channels)));
             }
             write_tile(frame, tile, {transmittance, 0}, color, opacity);
+        }
+    });
+}
+
+void weigh(Frame& frame, const float* counts, float* weights) {
+    float* const slots = frame.slots.fit(frame.tile_starts[frame.tiles]);
+    std::fill(slots, slots + frame.tile_starts[frame.tiles], 0.0f);  // layers behind exhausted pixels are not reached
+    in_pieces(frame.threads, frame.placed, 1, [&](int64_t begin, int64_t end, int) {
+        Scratch& scratch = this_threads_scratch();
+        float* const cells = scratch.cells.fit(static_cast<size_t>(TILE_VECTORS) * cell_size(0));
+        alignas(64) int32_t stops[TILE_PIXELS];
+        alignas(64) float here[TILE_PIXELS];
+        for (int64_t number = begin; number < end; ++number) {
+            const int tile = frame.order[number];
+            const TileFrame at = tile_frame(frame, tile);
+            for (int row = 0; row < at.rows; ++row) {
+                const int64_t start = static_cast<int64_t>(at.y + row) * frame.camera.width + at.x;
+                float* const out = here + row * TILE_WIDTH;
+                std::fill(out, out + TILE_WIDTH, 1.0f);
+                if (counts != nullptr) std::memcpy(out, counts + start, sizeof(float) * at.columns);
+            }
+            merged_list(frame, tile, scratch.layers);
+            composite<0, true>(scratch.layers, at, 0, cells, stops, here, slots);
+        }
+    });
+    constexpr int64_t GRAIN = 4096;
+    in_pieces(frame.threads, frame.gaussians.count, GRAIN, [&](int64_t begin, int64_t end, int) {
+        for (int64_t i = begin; i < end; ++i) {
+            weights[i] = 0.0f;
+            if (frame.keys[i] == NOT_DRAWN) continue;
+            const int32_t rank = frame.ranks[i];
+            for (int32_t slot = frame.slot_starts[rank]; slot < frame.slot_starts[rank + 1]; ++slot) weights[i] += slots[slot];
         }
     });
 }

@@ -97,8 +97,8 @@ struct Frame {
     const float* background;
     bool background_per_pixel;
 
-    // backward.cpp
-    Buffer<float> slots;          // [entries, slot_size(channels)]
+    // backward.cpp: [entries, slot_size(channels)]; `weigh`: [entries]
+    Buffer<float> slots;
 
     int tile_row(int tile) const { return tile / tile_columns; }
     int tile_column(int tile) const { return tile % tile_columns; }
@@ -118,6 +118,7 @@ bool project(Frame& frame);  // false where an input is not finite
 void sort_by_depth(Frame& frame);
 void bin(Frame& frame);
 void blend(Frame& frame, float* color, float* opacity);
+void weigh(Frame& frame, const float* counts, float* weights);
 void bake(Frame& frame);
 void backward(Frame& frame, const float* grad_color, const float* grad_opacity, const SplashGradients& gradients);
 

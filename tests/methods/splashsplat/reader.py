@@ -19,24 +19,27 @@ def read(directory: Path) -> dict[str, list[np.ndarray] | np.ndarray]:
     births = np.repeat(np.arange(len(rows["births"])), rows["births"])
     ends = births + rows["lives"]
     cells = np.stack(np.unravel_index(np.cumsum(rows["cells"].astype(int)), shape), axis=1)
-    place = cells * 32 + rows["within"]
+    steps = header["steps"]
+    place = cells * steps + rows["within"]
     moves = iter(rows["residuals"].astype(int))
     numbers, places = [], []
     for t in range(len(header["times"])):
         for number in np.flatnonzero((births < t) & (ends > t)):
-            velocity = _velocity(motion["velocities"][t - 1], factor, place[number] / 32)
+            velocity = _velocity(motion["velocities"][t - 1], factor, place[number] / steps)
             led = place[number] + np.rint(velocity / 2).astype(int)
-            place[number] = np.clip(led + next(moves), 0, shape * 32 - 1)
+            place[number] = np.clip(led + next(moves), 0, shape * steps - 1)
         numbers.append(np.flatnonzero((births <= t) & (ends > t)))
-        places.append(place[numbers[-1]] / 32)
+        places.append(place[numbers[-1]] / steps)
     assert next(moves, None) is None
     phi = np.cumsum(distance["phi"].astype(int), axis=0) / 4 + 1 / 8
-    coefficients = look["coefficients"].T.astype(float) * 2.0 ** look["coarseness"][:, None]
-    return {"ids": numbers, "places": places, "phi": phi, "values": coefficients @ look["basis"] + look["center"]}
+    values = np.zeros((len(rows["lives"]), len(look["center"])))
+    for level in range(6):
+        values[look["coarseness"] == level] = 2**level * (look[f"coefficients.{level}"].T @ look["basis"].astype(float))
+    return {"ids": numbers, "places": places, "phi": phi, "values": values + look["center"]}
 
 
 def _velocity(control: np.ndarray, factor: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """In 1/64 voxel a frame at `place` [3] (voxels), linear between control nodes."""
+    """In half a step a frame at `place` [3] (voxels), linear between control nodes."""
     nodes = np.array(control.shape[:3])
     at = np.clip((place - (factor - 1) / 2) / factor, 0, nodes - 1)
     low = np.minimum(at.astype(int), nodes - 2)

@@ -10,9 +10,11 @@ from splashbench.observe.grid import Grid
 from splashbench.render import freeze, rasterize, tile_modes
 from splashbench.scene.camera import Camera, look_at
 from splashbench_methods.splashsplat.appearance.active import Active, ActiveCarriers
+from splashbench_methods.splashsplat.appearance.compositing import composite, shares
 from splashbench_methods.splashsplat.appearance.contribution import contributions, least
-from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, ScaleResidual
+from splashbench_methods.splashsplat.appearance.decoder import Children, DecoderSettings, ScaleResidual
 from splashbench_methods.splashsplat.appearance.fitting import FitSettings, fit_appearance, initial_appearance
+from splashbench_methods.splashsplat.appearance.glass import Splats
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.subframe import Track
@@ -171,6 +173,34 @@ def test_a_gaussian_behind_an_opaque_one_makes_up_little() -> None:
     )
     assert drawn[1] < 0.2 * alone[0]
     assert drawn[2] == pytest.approx(float(alone[0]), rel=0.1)
+
+
+@pytest.mark.parametrize("case", ["over", "wall", "in front", "glass", "together"])
+def test_the_renderer_weighs_carriers_as_the_derivative_does(case: str) -> None:
+    camera = _target().camera
+    rng = np.random.default_rng(0)
+
+    def some(*shape: int) -> torch.Tensor:
+        return torch.from_numpy(rng.uniform(0, 1, shape).astype(np.float32))
+
+    n = 40
+    means = some(n, 2, 3) * torch.tensor([10.0, 4, 6]) - torch.tensor([2.0, 0, 2])
+    children = Children(means, 0.4 * some(n, 2, 3, 3), 0.05 + 0.9 * some(n, 2), some(n, 2, 3), some(n, 2, 3))
+    background = some(camera.height, camera.width, 3)
+    wall = some(camera.height, camera.width) if case in ("wall", "in front") else None
+    in_front = some(n) < 0.3 if case == "in front" else None
+    other = Splats(some(9, 3) * 4, some(9, 3, 3), some(9), some(9, 3))
+    frozen = freeze(*vars(other).values(), camera) if case == "together" else None
+    glass = other if case == "glass" else None
+
+    def drawn(colors: torch.Tensor) -> torch.Tensor:
+        shown = replace(children, colors=colors)
+        return composite(shown, camera, background, frozen, None, wall, in_front, glass)[0]
+
+    expected = contributions(children.colors, drawn)
+    found = shares(children, camera, frozen, wall, in_front, glass)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    assert float(found.max()) > 1
 
 
 def test_least_takes_no_more_than_the_share() -> None:

@@ -19,6 +19,7 @@ from splashbench_methods import scaffold_gs
 from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, reconstruction, smaller
 from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.fitting import Fit
+from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.appearance.warm_start import Learned
 from splashbench_methods.splashsplat.carriers.subframe import Track
 from splashbench_methods.splashsplat.method import FittedSplashSplat
@@ -83,6 +84,38 @@ def test_the_first_iterations_are_made_on_coarse_grids(
     without = fitted(balls, iterations=60, coarse_grids_share=0.0)
     assert steps == {fine: 60}
     assert error(with_it, balls) < error(without, balls)
+
+
+def test_a_fit_that_looks_at_withheld_photographs_has_not_seen_them_on_coarse_grids(
+    balls: Scene, flat_background: None, coarse_fits: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[float, set[tuple[str, int]]] = {}
+    of, look = fitting.ActiveCarriers.of, fitting.EarningSchedule.look
+    looks = 0
+
+    def note(self: fitting.ActiveCarriers, target: TrainingTarget) -> Any:
+        seen.setdefault(self._track.grid.voxel, set()).add((target.camera.name, target.frame))
+        return of(self, target)
+
+    def count(self: fitting.EarningSchedule, iteration: int, found: Any) -> None:
+        nonlocal looks
+        looks += 1
+        look(self, iteration, found)
+
+    def chosen(count: int, share: float, rng: Any) -> np.ndarray:
+        return np.arange(count) < 3
+
+    monkeypatch.setattr(fitting.ActiveCarriers, "of", note)
+    monkeypatch.setattr(fitting.EarningSchedule, "look", count)
+    monkeypatch.setattr(fitting, "withheld", chosen)
+    monkeypatch.setattr(fitting, "_LOOK_EVERY", 5)
+    # Without looks for idle carriers, which ask about all photographs.
+    withholding = {"validation_share": 0.04, "price": 0.1, "idle_share": 0.0}
+    fitted(balls, iterations=200, coarse_grids_share=0.4, **withholding)
+    assert coarse_fits == [80]
+    fine, coarse = sorted(seen)
+    assert looks > 0
+    assert len(seen[fine] - seen[coarse]) == 3
 
 
 def on_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -272,7 +305,7 @@ def test_a_run_aside_leaves_no_record(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "budget"),
     [
-        ({"validation_share": 0.04}, Budget()),
+        ({"validation_share": 0.04, "price": 0.0}, Budget()),
         ({"plates_share": 0.0}, Budget()),
         ({}, Budget(seconds=60.0)),
         ({"coarse_grids_share": 0.0}, Budget()),

@@ -191,6 +191,28 @@ def test_one_that_pays_to_the_end_has_the_rates_of_a_fixed_one():
     assert withheld_until == 1999
 
 
+def test_what_another_fit_began_is_gone_on_with():
+    """Rates, the end and what time is worth count from the first iteration of both; looks from the second fit's own."""
+
+    def run(begun: int) -> tuple[EarningSchedule, list[float]]:
+        schedule = EarningSchedule(3000, every=100, price=0.1, before=1500, fall=0.5, begun=begun)
+        found: list[float] = []
+        while (factor := schedule.factor(len(found))) is not None:
+            found.append(factor)
+            assert schedule.done(len(found)) == pytest.approx((begun + len(found)) / schedule._end)
+            if schedule.due(len(found)):
+                quality = min(begun + len(found), 1700) / 100
+                schedule.look(len(found), WithheldLook(0.0, np.full(3, float(quality))))
+        return schedule, found
+
+    whole, later = run(0), run(600)
+    assert later[0].earned[0].iterations == (1000, 1400)
+    assert later[0].earned[0].price == next(e.price for e in whole[0].earned if e.iterations == (1000, 1400))
+    assert later[0].earned[-1].iterations[1] == whole[0].earned[-1].iterations[1]
+    assert later[1] == whole[1][600:]
+    assert not EarningSchedule(3000, every=100, price=0.1, before=1500, fall=0.5, begun=1300).may_stop
+
+
 def test_rates_go_on_falling_from_where_they_were():
     schedule = EarningSchedule(6000, every=100, price=0.1, before=1500, fall=0.5)
     found: list[float] = []
