@@ -106,16 +106,21 @@ def shares(
     """Pixels of the image of `composite` that each of n carriers makes up, float32 [n], on the CPU: the derivative of a
     channel, summed over pixels, by its Gaussians' colours. Arguments as there."""
     shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
+
+    def of(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        means, factors, opacities = (values[part] for values in shapes)
+        return means, factors, opacities
+
     if glass is not None:
-        parts = (torch.cat(pair) for pair in zip(shapes, (glass.means, glass.factors, glass.opacities)))
-        found = compositing_weights(*parts, camera)[: len(shapes[2])]
+        theirs = glass.means, glass.factors, glass.opacities
+        means, factors, opacities = (torch.cat(pair) for pair in zip(shapes, theirs))
+        found = compositing_weights(means, factors, opacities, camera)[: len(shapes[2])]
     elif wall is None or in_front is None or not bool(in_front.any()):
         found = compositing_weights(*shapes, camera, counts=None if wall is None else 1 - wall, frozen=frozen)
     else:
         first = in_front.repeat_interleave(children.opacities.shape[1])
-        nearer, farther = (tuple(values[chosen] for values in shapes) for chosen in (first, ~first))
-        _, opacity = rasterize(*nearer, None, camera)
+        _, opacity = rasterize(*of(first), None, camera)
         found = np.empty(len(first), dtype=np.float32)
-        found[first.numpy()] = compositing_weights(*nearer, camera)
-        found[~first.numpy()] = compositing_weights(*farther, camera, counts=(1 - wall) * (1 - opacity))
+        found[first.numpy()] = compositing_weights(*of(first), camera)
+        found[~first.numpy()] = compositing_weights(*of(~first), camera, counts=(1 - wall) * (1 - opacity))
     return torch.from_numpy(found).reshape(children.opacities.shape).sum(dim=1)
