@@ -155,10 +155,13 @@ def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, f
     frame = np.arange(balls.n_frames)[:, None]
     np.testing.assert_array_equal(particles.active, (frame >= births) & (frame <= ends))
     assert (ends > births).mean() > 0.3  # enough of them live on for the energy to mean something
-    # Between two frames of its life a carrier moves by the velocity (at most 8 voxels) and the correction (at most 1).
+    # Between two frames of its life a carrier moves by the velocity (at most 8 voxels) and the correction (at most 1);
+    # both places are rounded, and misses of some steps are spared.
+    precision = fitted.liquid.precision
+    rounding = 3**0.5 * (1 + precision.spared) / precision.steps
     alive = particles.active[1:] & particles.active[:-1]
     moved = np.linalg.norm(np.diff(particles.positions, axis=0), axis=2)[alive] / fitted.liquid.grid.voxel
-    assert moved.max() <= 9.05
+    assert moved.max() <= 9 + rounding
     # What it does between them is the forecast, but for the correction.
     liquid = fitted.liquid
     for t in range(balls.n_frames - 1):
@@ -167,7 +170,7 @@ def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, f
         ids = liquid.carriers.ids[rows][lives]
         there, _ = liquid.motion.step(t).forecast(x, F)
         off = np.linalg.norm(liquid.grid.to_voxels(particles.positions[t + 1, ids]) - there, axis=1)
-        assert off.max() <= 1.05
+        assert off.max() <= 1 + rounding
 
 
 def test_particle_velocities_are_seconds_not_frames(balls: Scene, fitted: FittedSplashSplat):
