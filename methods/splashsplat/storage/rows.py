@@ -4,9 +4,7 @@ A carrier's place in a frame is predicted from its place in the frame before by 
 is stored. F is not stored: it is the identity at birth, and the stored motion deforms it. Nor is phi at a carrier. The
 prediction is made of single IEEE operations in double precision, so that every machine finds the same whole numbers.
 
-How long a step is, the photographs decide: a sixteenth of a voxel where a voxel is about a pixel. Where the motion
-misses a carrier by less than photographs can show, nothing is stored, and it is where the motion leads. The next
-difference is to that place, so that misses do not add up.
+How long a step is, the photographs decide: a sixteenth of a voxel where a voxel is about a pixel.
 """
 
 from __future__ import annotations
@@ -76,28 +74,23 @@ def stored_order(carriers: Carriers, shape: tuple[int, int, int], steps: int) ->
     )
 
 
-def store_rows(
-    carriers: Carriers, control: NDArray[np.int16], motion: Motion, grid: Grid, precision: Precision
-) -> StoredRows:
-    """Carriers in whole numbers; control: `whole_velocities` of the motion. Raises ValueError where a carrier's life
-    has a gap, or carriers are not numbered by the frame of their birth."""
+def store_rows(carriers: Carriers, control: NDArray[np.int16], motion: Motion, grid: Grid, steps: int) -> StoredRows:
+    """Carriers in whole numbers; control: `whole_velocities` of the motion; steps: of `Precision`. Raises ValueError
+    where a carrier's life has a gap, or carriers are not numbered by the frame of their birth."""
     births, ends = carriers.births_and_ends()
     lives = ends.astype(np.int64) - births + 1
     if (np.diff(births) < 0).any() or (lives < 1).any() or lives.sum() != len(carriers.ids):
         raise ValueError("carriers must be numbered by the frame of their birth and last without a gap")
-    cells, within = _steps_of(carriers.positions[_first_rows(carriers)], grid.shape, precision.steps)
+    cells, within = _steps_of(carriers.positions[_first_rows(carriers)], grid.shape, steps)
     residuals = []
-    steps = _whole(carriers.positions[carriers.rows(0)], grid.shape, precision.steps)
+    places = _whole(carriers.positions[carriers.rows(0)], grid.shape, steps)
     for t in range(1, carriers.n_frames):
         before, now = carriers.rows(t - 1), carriers.rows(t)
         stays = births[carriers.ids[now]] < t
-        places = np.searchsorted(carriers.ids[before], carriers.ids[now][stays])
-        predicted = _predicted(steps[places], control[t - 1], motion, precision.steps)
-        steps = _whole(carriers.positions[now], grid.shape, precision.steps)
-        missed = steps[stays] - predicted
-        missed[np.abs(missed) <= precision.spared] = 0
-        steps[stays] = _clipped(predicted + missed, grid.shape, precision.steps)
-        residuals.append(missed.astype(np.int32))
+        rows = np.searchsorted(carriers.ids[before], carriers.ids[now][stays])
+        predicted = _predicted(places[rows], control[t - 1], motion, steps)
+        places = _whole(carriers.positions[now], grid.shape, steps)
+        residuals.append((places[stays] - predicted).astype(np.int32))
     joined = np.concatenate(residuals) if residuals else np.zeros((0, 3), np.int32)
     kind = np.min_scalar_type(-int(np.abs(joined).max(initial=0)) - 1)
     return StoredRows(

@@ -70,7 +70,7 @@ def motion_arrays(track: Track) -> dict[str, np.ndarray]:
 def carrier_arrays(track: Track, carriers: Carriers, carried: bool) -> dict[str, np.ndarray]:
     """What is stored of `carriers`, those of `track` or some of them."""
     control = whole_velocities(track.motion.velocities, track.precision)
-    rows = dict(vars(store_rows(carriers, control, track.motion, track.grid, track.precision)))
+    rows = dict(vars(store_rows(carriers, control, track.motion, track.grid, track.precision.steps)))
     if not carried:
         rows["deformation"] = carriers.deformation.astype(np.float16)
     return rows

@@ -156,9 +156,8 @@ def test_a_row_of_the_particles_is_one_carrier_from_birth_to_end(balls: Scene, f
     np.testing.assert_array_equal(particles.active, (frame >= births) & (frame <= ends))
     assert (ends > births).mean() > 0.3  # enough of them live on for the energy to mean something
     # Between two frames of its life a carrier moves by the velocity (at most 8 voxels) and the correction (at most 1);
-    # both places are rounded, and misses of some steps are spared.
-    precision = fitted.liquid.precision
-    rounding = 3**0.5 * (1 + precision.spared) / precision.steps
+    # both places are rounded.
+    rounding = 3**0.5 / fitted.liquid.precision.steps
     alive = particles.active[1:] & particles.active[:-1]
     moved = np.linalg.norm(np.diff(particles.positions, axis=0), axis=2)[alive] / fitted.liquid.grid.voxel
     assert moved.max() <= 9 + rounding
