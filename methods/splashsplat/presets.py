@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "best": {"storage_tolerance": 0.01},
+    "best": {},
     "auto": {
         "observable": True,
         "validation_share": 0.04,

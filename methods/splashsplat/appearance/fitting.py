@@ -256,6 +256,13 @@ def _schedule(settings: FitSettings, count: int, clock: Clock | None, seed: int)
     return (adaptive, chosen) if chosen.any() else (fixed, none)
 
 
+def _fitted(withheld_targets: np.ndarray, withholds: bool) -> np.ndarray:
+    """The photographs that the fit sees next, int64 [n]: all others while some are withheld (bool [count]); afterwards
+    all of them, and those that were withheld twice, to catch up."""
+    others, late = np.flatnonzero(~withheld_targets), np.flatnonzero(withheld_targets)
+    return others if withholds else np.concatenate([np.arange(len(withheld_targets)), late])
+
+
 def fit_appearance(
     appearance: Appearance,
     track: Track,
@@ -425,8 +432,7 @@ def fit_appearance(
             for target in targets:
                 target.coarse = None  # large, and not wanted any more
         if not queue:
-            fitted = np.nonzero(~withheld_targets)[0] if schedule.withholds else np.arange(len(targets))
-            queue = rng.permutation(fitted).tolist()
+            queue = rng.permutation(_fitted(withheld_targets, schedule.withholds)).tolist()
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
             carriers.drop(transparent())
             features.keep(carriers.ids)

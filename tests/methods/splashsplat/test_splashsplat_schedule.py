@@ -155,6 +155,13 @@ def test_withheld_photographs_are_fitted_once_the_rates_fall(many_balls: Scene, 
     assert 0.08 * everything <= len(second - first) <= 0.1 * everything + 1
 
 
+def test_what_was_withheld_comes_twice_as_often_afterwards():
+    some = np.array([False, True, False, False, True])
+    assert sorted(fit._fitted(some, withholds=True)) == [0, 2, 3]
+    assert sorted(fit._fitted(some, withholds=False)) == [0, 1, 1, 2, 3, 4, 4]
+    assert sorted(fit._fitted(np.zeros(3, bool), withholds=False)) == [0, 1, 2]
+
+
 def earning(quality: Callable[[int], float], price: float = 0.1, limit: int = 6000) -> tuple[EarningSchedule, int]:
     """A schedule whose withheld photographs have the `quality` (dB) at each iteration; and how many it had."""
     schedule = EarningSchedule(limit, every=100, price=price, before=1500, fall=0.5)
