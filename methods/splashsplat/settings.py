@@ -15,7 +15,8 @@ from splashbench.observe.signed_distance import SignedDistanceMethod
 
 from .appearance.decoder import DecoderSettings, ScaleResidual
 from .appearance.first_look import LEAST_FEATURES, LEAST_HIDDEN
-from .appearance.fitting import Composition, FitSettings
+from .appearance.fit_settings import FitSettings
+from .appearance.fitting import Composition
 from .appearance.losses import LossWeights
 from .appearance.targets import SilhouetteNorm
 from .carriers.between import BetweenFrames

@@ -13,7 +13,8 @@ from splashbench_methods.splashsplat.appearance.active import Active, ActiveCarr
 from splashbench_methods.splashsplat.appearance.compositing import composite, shares
 from splashbench_methods.splashsplat.appearance.contribution import contributions, least
 from splashbench_methods.splashsplat.appearance.decoder import Children, DecoderSettings, ScaleResidual
-from splashbench_methods.splashsplat.appearance.fitting import FitSettings, fit_appearance, initial_appearance
+from splashbench_methods.splashsplat.appearance.fit_settings import FitSettings
+from splashbench_methods.splashsplat.appearance.fitting import fit_appearance, initial_appearance
 from splashbench_methods.splashsplat.appearance.glass import Splats
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
 from splashbench_methods.splashsplat.carriers.population import Carriers

@@ -10,7 +10,8 @@ import torch
 from splashbench.observe.grid import Grid
 from splashbench_methods.splashsplat.appearance.decoder import DecoderSettings, initial_log_scale
 from splashbench_methods.splashsplat.appearance.first_look import Look, features_of
-from splashbench_methods.splashsplat.appearance.fitting import Appearance, FitSettings, initial_appearance
+from splashbench_methods.splashsplat.appearance.fit_settings import FitSettings
+from splashbench_methods.splashsplat.appearance.fitting import Appearance, initial_appearance
 from splashbench_methods.splashsplat.appearance.glass import Glass
 from splashbench_methods.splashsplat.appearance.schedule import FixedSchedule
 from splashbench_methods.splashsplat.appearance.warm_start import Learned, hand_on, nearest_carriers
