@@ -251,6 +251,8 @@ def compositing_weights(
     by_pixel = None if counts is None else arguments.floats(counts, "counts")
     if by_pixel is not None and by_pixel.shape != (camera.height, camera.width):
         raise ValueError(f"counts is {list(by_pixel.shape)}, not {[camera.height, camera.width]}")
+    if by_pixel is not None and not np.isfinite(by_pixel).all():
+        raise ValueError("counts holds values that are not finite")
     found = memory.empty((len(arrays[0]),))
     status = KERNEL.library.splash_weigh(
         ctypes.byref(_camera(camera)),

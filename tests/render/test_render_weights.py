@@ -89,6 +89,8 @@ def test_bad_arguments_are_named(camera):
     means, factors, opacities = scatter(5, 9)
     with pytest.raises(ValueError, match="counts"):
         compositing_weights(means, factors, opacities, camera, counts=np.ones((3, 3), np.float32))
+    with pytest.raises(ValueError, match="counts"):
+        compositing_weights(means, factors, opacities, camera, counts=np.full((93, 171), np.nan, np.float32))
     with pytest.raises(ValueError, match="means"):
         compositing_weights(means * np.nan, factors, opacities, camera)
     with pytest.raises(ValueError, match="factors"):

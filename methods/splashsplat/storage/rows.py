@@ -115,8 +115,10 @@ def read_rows(
         raise ValueError("births, lives and cells are of different numbers of carriers")
     if stored.within.shape != (count, 3) or stored.residuals.ndim != 2 or stored.residuals.shape[1] != 3:
         raise ValueError("positions are not of three coordinates each")
-    if count and stored.within.max() >= steps:
-        raise ValueError(f"a place in a cell is beyond its {steps} steps")
+    if any(array.dtype.kind not in "iu" for array in (*vars(stored).values(), control)):
+        raise ValueError("carriers or velocities are no whole numbers")
+    if count and not 0 <= stored.within.min() <= stored.within.max() < steps:
+        raise ValueError(f"a place in a cell is none of its {steps} steps")
     births = np.repeat(np.arange(n_frames), stored.births)
     lives = stored.lives.astype(np.int64)
     ends = births + lives
