@@ -12,9 +12,9 @@ from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.scene.scene import TrainingScene
 
 from .fields.container import KnownContainer
-from .reconstruction import Traced, trace_liquid
 from .settings import SplashSplatConfig
 from .smaller import draft_of
+from .trace import Traced, trace_liquid
 
 # Hull cells along the longest side that may be chosen.
 _CELLS = (128, 160, 200, 240, 300)

@@ -14,8 +14,8 @@ from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.scene.scene import TrainingScene
 
 from .affordable import with_cells
-from .reconstruction import Traced
 from .settings import SplashSplatConfig
+from .trace import Traced
 
 # Bytes that a fit has at its peak beside the process as it is before the fit: for a carrier, for a byte of the packed
 # phi, for a pixel of the largest photograph, and for the rest. All but the pixels are a least-squares fit to twelve

@@ -16,9 +16,10 @@ from splashbench.scene.scene import TrainingScene
 from .appearance.warm_start import Learned
 from .fields.container import KnownContainer
 from .fields.observations import Sightings
-from .reconstruction import Reconstruction, fit_liquid, trace_liquid
+from .reconstruction import Reconstruction, fit_liquid
 from .settings import SplashSplatConfig
 from .smaller import coarse_of
+from .trace import trace_liquid
 
 # Share of it that the trace takes, for the progress bar only.
 _TRACE = 0.4

@@ -36,8 +36,9 @@ from .coarse_fit import begins_on_coarse_grids, fit_coarsely
 from .draft import State, make_draft
 from .fields.container import KnownContainer, known_container
 from .fields.observations import Sightings
-from .reconstruction import Reconstruction, Traced, fit_liquid, trace_liquid
+from .reconstruction import Reconstruction, fit_liquid
 from .settings import SplashSplatConfig
+from .trace import Traced, trace_liquid
 from .transmittance import transmittance
 
 if TYPE_CHECKING:

@@ -19,9 +19,10 @@ from splashbench.scene.scene import TrainingScene
 from .fields.container import KnownContainer
 from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
-from .reconstruction import Reconstruction, fit_liquid, trace_liquid
+from .reconstruction import Reconstruction, fit_liquid
 from .settings import SplashSplatConfig
 from .smaller import draft_of
+from .trace import trace_liquid
 
 if TYPE_CHECKING:
     from ..scaffold_gs import Background, Plates

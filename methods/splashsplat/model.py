@@ -27,6 +27,7 @@ from .carriers.between import BetweenFrames
 from .carriers.population import Carriers
 from .carriers.precision import HIGHEST, Precision
 from .carriers.subframe import Track, locate
+from .fields.sparse_frames import Frames
 from .motion.between import moved_distance
 from .motion.steps import Motion
 from .motion.velocity import Factor
@@ -79,7 +80,7 @@ class Liquid:
     grid: Grid
     carriers: Carriers
     motion: Motion
-    phi: np.ndarray
+    phi: Frames
     appearance: Appearance
     carried: bool = True
     composition: Composition = "over"
@@ -179,7 +180,11 @@ class Liquid:
 
     def signed_distance(self) -> SignedDistance | None:
         """phi_t of every frame on the transport grid; None where that is more than a submission may hold."""
-        return None if self.phi.nbytes > MAX_BYTES else SignedDistance(self.phi, self.grid.origin, self.grid.voxel)
+        return (
+            None
+            if self.phi.nbytes > MAX_BYTES
+            else SignedDistance(np.asarray(self.phi), self.grid.origin, self.grid.voxel)
+        )
 
     def surface(self, time: float) -> SignedDistance:
         """phi at `time` (seconds), one instant: each frame's around it moved there by u_t, blended by nearness."""
@@ -187,11 +192,12 @@ class Liquid:
         if self._surface is not None and self._surface[0] == time:
             return self._surface[1]
         t, fraction = locate(self.times, time)
-        phi = self.phi[t : t + 1]
-        if fraction != 0:
+        if fraction == 0:
+            phi = self.phi[t]
+        else:
             first, share = (t, fraction) if fraction > 0 else (t - 1, 1 + fraction)
-            phi = moved_distance(self.phi[first], self.phi[first + 1], self.motion.step(first), share)[None]
-        surface = SignedDistance(phi, self.grid.origin, self.grid.voxel)
+            phi = moved_distance(self.phi[first], self.phi[first + 1], self.motion.step(first), share)
+        surface = SignedDistance(phi[None], self.grid.origin, self.grid.voxel)
         self._surface = time, surface
         return surface
 

@@ -39,6 +39,8 @@ LEAST_FEATURES, LEAST_HIDDEN = _CERTAINTY + 1, _PASSING
 GIVEN = _CERTAINTY + 1
 # The other units' say at the start, as a share of what they would have.
 _NOISE = 0.1
+# Carriers whose sums become colours at once: those of all take as much memory as what is learned of them.
+_BLOCK = 1 << 16
 # No carrier is hidden.
 _EVERY = np.zeros(0, dtype=bool)
 
@@ -98,7 +100,6 @@ def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
     photograph have the mean colour of the others.
     """
     sums = np.zeros((track.carriers.count, 7))
-    weights, sums_of_colors, sums_of_squares = sums[:, 0], sums[:, 1:4], sums[:, 4:]
     reach = _SEEN_WITHIN * track.grid.voxel
     reader = ReadAhead()
     for target, following in zip(targets, [*targets[1:], None]):
@@ -120,12 +121,22 @@ def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
             sums,
         )
     reader.close()
-    known = weights > 0
-    total = np.maximum(weights, 1e-9)[:, None]
-    mean = sums_of_colors.sum(axis=0) / weights.sum() if known.any() else np.full(3, 0.5)
-    colors = np.where(known[:, None], sums_of_colors / total, mean)
-    variance = np.where(known, np.maximum(sums_of_squares / total - colors**2, 0).mean(axis=1), 0.0)
-    return Look(colors.astype(np.float32), np.sqrt(variance).astype(np.float32))
+    seen_at_all = sums[:, 0].any()
+    mean = sums[:, 1:4].sum(axis=0) / sums[:, 0].sum() if seen_at_all else np.full(3, 0.5)
+    look = Look(np.empty((len(sums), 3), np.float32), np.empty(len(sums), np.float32))
+    for start in range(0, len(sums), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        look.colors[rows], look.spread[rows] = _mean_and_spread(sums[rows], mean)
+    return look
+
+
+def _mean_and_spread(sums: np.ndarray, otherwise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours [n, 3] and spread [n] of `sums` [n, 7] of `_add`; `otherwise` [3], and none, where nothing was added."""
+    weights = sums[:, 0]
+    known, total = weights > 0, np.maximum(weights, 1e-9)[:, None]
+    colors = np.where(known[:, None], sums[:, 1:4] / total, otherwise)
+    variance = np.where(known, np.maximum(sums[:, 4:] / total - colors**2, 0).mean(axis=1), 0.0)
+    return colors, np.sqrt(variance)
 
 
 def features_of(look: Look) -> torch.Tensor:

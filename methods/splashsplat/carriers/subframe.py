@@ -18,6 +18,7 @@ from splashbench.observe.grid import Grid
 from splashbench.observe.kernels import sample
 from splashbench.scene.geometry import STEPS_PER_VOXEL
 
+from ..fields.sparse_frames import Frames
 from ..motion.steps import Motion
 from .population import Carriers
 from .precision import HIGHEST, Precision
@@ -74,7 +75,7 @@ class Track:
     grid: Grid
     carriers: Carriers
     motion: Motion
-    phi: np.ndarray
+    phi: Frames
     precision: Precision = HIGHEST
 
     def ids(self, t: int) -> Tensor:

@@ -136,6 +136,8 @@ class Observations:
                         phi = self.cues.refined(phi, self.hull_grid, t)
                     phi = _converted(phi, np.float16)
             yield phi
+            if t + 1 < self.n_frames and not self.repeated[t + 1]:
+                phi = None  # large, while the next one is carved
 
     def in_transport_voxels(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`phi` of `signed_distances` as float32 in transport voxels, on the hull grid and on the transport grid."""

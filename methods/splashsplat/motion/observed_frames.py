@@ -106,7 +106,10 @@ def _frames(
         elif before is not None:
             step = FrameStep(control(t - 1, before, now), fit.factor, fit.fall(t - 1))
         before = now
-        yield ObservedFrame(phi, packed, step, repeated)
+        frame = ObservedFrame(phi, packed, step, repeated)
+        del stored, phi, packed, now
+        yield frame
+        del frame  # large, and the next one comes
         report(progress + (1 - progress) * (t + 1) / observations.n_frames, what)
 
 

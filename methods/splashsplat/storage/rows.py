@@ -22,6 +22,7 @@ from splashbench.scene.geometry import STEPS_PER_VOXEL
 
 from ..carriers.population import Carriers, taken
 from ..carriers.precision import Precision
+from ..fields.sparse_frames import Frames
 from ..motion.steps import Motion
 from ..motion.velocity import factors
 
@@ -103,7 +104,7 @@ def store_rows(carriers: Carriers, control: NDArray[np.int16], motion: Motion, g
 
 
 def read_rows(
-    stored: StoredRows, control: NDArray[np.int16], motion: Motion, phi: np.ndarray, grid: Grid, steps: int
+    stored: StoredRows, control: NDArray[np.int16], motion: Motion, phi: Frames, grid: Grid, steps: int
 ) -> Carriers:
     """The carriers that `store_rows` was given, to within its precision. control, motion: as there; phi: int8
     [T, nx, ny, nz], packed; steps: of `Precision`.

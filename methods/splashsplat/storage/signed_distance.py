@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from splashbench.scene.geometry import MAX_STEPS, STEPS_PER_VOXEL
 
+from ..fields.sparse_frames import Frames
+
 # Steps of the packed phi that one stored step makes up.
 _COARSER = STEPS_PER_VOXEL // 4
 # Stored steps to either side: as far as carriers fade on their way to where no liquid is (carriers/between.py); and as
@@ -23,22 +25,22 @@ def reach(opacity_slope: float, opacity_band: float) -> int:
 
 
 def coarse_distance(packed: NDArray[np.int8], steps: int) -> NDArray[np.int8]:
-    """Packed phi to the middles of stored steps, at most `steps` of them to either side: packed phi again.
+    """Packed phi of a frame to the middles of stored steps, at most `steps` of them to either side: packed phi again.
 
     What is below 0 stays below it, and the other way round.
     """
-    coarse = np.empty_like(packed)
-    for t, frame in enumerate(packed):  # all frames at once would be in memory several times
-        whole = np.clip(frame // np.int8(_COARSER), -steps, steps - 1)
-        coarse[t] = whole * _COARSER + _COARSER // 2
-    return coarse
+    whole = np.clip(packed // np.int8(_COARSER), -steps, steps - 1)
+    return np.asarray(whole * _COARSER + _COARSER // 2, dtype=np.int8)
 
 
-def store_distance(packed: NDArray[np.int8]) -> NDArray[np.int8]:
+def store_distance(packed: Frames) -> NDArray[np.int8]:
     """What `coarse_distance` gave for all frames [T, nx, ny, nz], as it is stored."""
-    stored = packed // np.int8(_COARSER)
-    for t in range(len(stored) - 1, 0, -1):
-        stored[t] -= stored[t - 1]
+    stored = np.empty(packed.shape, np.int8)
+    before = np.zeros(packed.shape[1:], np.int8)
+    for t in range(len(packed)):
+        whole = packed[t] // np.int8(_COARSER)
+        stored[t] = whole - before
+        before = whole
     return stored
 
 

@@ -13,11 +13,12 @@ from splashbench.observe.grid import Grid
 from ..carriers.population import Carriers
 from ..carriers.precision import Precision
 from ..carriers.subframe import Track
+from ..fields.sparse_frames import Frames
 from ..motion.fall import falls_of, table_of
 from ..motion.steps import Motion
 from ..motion.velocity import Factor
 from .rows import StoredRows, read_rows, store_rows, stored_order, whole_velocities
-from .signed_distance import coarse_distance, read_distance, store_distance
+from .signed_distance import read_distance, store_distance
 
 #: Arrays of the files of a track, each with its number of dimensions; `deformation` is optional.
 CARRIERS: Mapping[str, int] = {"births": 1, "lives": 1, "cells": 1, "within": 2, "residuals": 2}
@@ -26,21 +27,17 @@ MOTION: Mapping[str, int] = {"velocities": 5, "jets": 2, "turn": 2}
 DISTANCE: Mapping[str, int] = {"phi": 4}
 
 
-def stored_track(track: Track, times: np.ndarray, carried: bool, distance_steps: int, precision: Precision) -> Track:
-    """`track` in the precision in which it is stored, its carriers numbered anew.
+def stored_track(track: Track, times: np.ndarray, carried: bool, precision: Precision) -> Track:
+    """`track` in the precision in which it is stored, its carriers numbered anew; its phi is in stored steps already.
 
     times: [T] of the frames, seconds. carried: whether the motion is what moved the carriers; else their F is stored.
-    distance_steps: of phi to either side, see `reach`. precision: of places and velocities.
+    precision: of places and velocities.
     """
-    coarse = replace(
-        track,
-        carriers=stored_order(track.carriers, track.grid.shape, precision.steps),
-        phi=coarse_distance(track.phi, distance_steps),
-        precision=precision,
-    )
+    carriers = stored_order(track.carriers, track.grid.shape, precision.steps)
+    coarse = replace(track, carriers=carriers, precision=precision)
     rows, moves = carrier_arrays(coarse, coarse.carriers, carried), motion_arrays(coarse)
     phi = coarse.phi
-    del coarse
+    del coarse, carriers
     memory.give_back()
     motion = _read_motion(moves, track.grid, times, track.motion.factor, precision)
     carriers = _read_carriers(rows, moves, motion, phi, track.grid, precision)
@@ -56,7 +53,7 @@ def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]
     }
 
 
-def distance_arrays(phi: np.ndarray) -> dict[str, np.ndarray]:
+def distance_arrays(phi: Frames) -> dict[str, np.ndarray]:
     """What is stored of the packed phi of all frames."""
     return {"phi": store_distance(phi)}
 
@@ -104,7 +101,7 @@ def _read_carriers(
     arrays: Mapping[str, np.ndarray],
     moves: Mapping[str, np.ndarray],
     motion: Motion,
-    phi: np.ndarray,
+    phi: Frames,
     grid: Grid,
     precision: Precision,
 ) -> Carriers:

@@ -23,7 +23,7 @@ from splashbench_methods.splashsplat.appearance.photographs import read_now
 from splashbench_methods.splashsplat.appearance.projection import projected_extent
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget, collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState, Track
-from splashbench_methods.splashsplat.reconstruction import trace_liquid
+from splashbench_methods.splashsplat.trace import trace_liquid
 
 # Nothing here asks how good the background is, which would take most of the time.
 pytestmark = pytest.mark.usefixtures("short_background")

@@ -23,7 +23,8 @@ from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.subframe import Track
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.motion.steps import Motion
-from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.trace import trace_liquid
 
 CAMERA = Camera("c", 40, 40, np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.eye(4))
 BLUE = torch.tensor([0.0, 0.0, 1.0])

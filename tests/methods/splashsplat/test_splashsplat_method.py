@@ -21,7 +21,8 @@ from splashbench_methods.splashsplat.appearance.targets import collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import locate
 from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.motion.velocity import control_shape
-from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.trace import trace_liquid
 
 TINY = {"hull_cells": 64, "transport_cells": 48, "control_cells": 12, "iterations": 200, "ssim_every": 2}
 

@@ -15,7 +15,7 @@ from splashbench.scene import Scene
 from splashbench_methods.splashsplat import SplashSplat
 from splashbench_methods.splashsplat.fields.repeats import repeated_frames
 from splashbench_methods.splashsplat.method import FittedSplashSplat
-from splashbench_methods.splashsplat.reconstruction import trace_liquid
+from splashbench_methods.splashsplat.trace import trace_liquid
 
 TINY = {"hull_cells": 40, "transport_cells": 20, "control_cells": 6, "iterations": 30, "voxel_pixels": 0}
 

@@ -18,7 +18,8 @@ from splashbench.synth.balls import ball_centers
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig
 from splashbench_methods.splashsplat.fields.occlusion import LiquidOcclusion
 from splashbench_methods.splashsplat.model import Liquid
-from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid
+from splashbench_methods.splashsplat.trace import trace_liquid
 
 RADII = np.array([0.10, 0.08, 0.06])  # of the balls, metres
 TINY = {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "iterations": 12}

@@ -21,8 +21,9 @@ from splashbench_methods.splashsplat.appearance.schedule import (
     WithheldLook,
     withheld,
 )
-from splashbench_methods.splashsplat.reconstruction import fit_liquid, trace_liquid
+from splashbench_methods.splashsplat.reconstruction import fit_liquid
 from splashbench_methods.splashsplat.settings import SplashSplatConfig
+from splashbench_methods.splashsplat.trace import trace_liquid
 
 TINY = {"hull_cells": 48, "transport_cells": 32, "control_cells": 8, "ssim_every": 4}
 
