@@ -108,7 +108,6 @@ def fit_liquid(
             beginning, traced, backgrounds, run, span, None if offer is None else offer_state, settled, _clock(run)
         )
     appearance, look = beginning.appearance, beginning.look
-    del beginning  # large: the photographs
     memory.forget()  # what comes has other sizes
     if keep is not None and fit is not None:
         keep(Learned(traced.track, appearance, look))
