@@ -10,12 +10,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import math
 import os
 import signal
 import subprocess
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,13 @@ class StoppedRun:
         paused: whether the fit was under way and paused when it ended.
         exit_code: of the run, negative for a signal; None where it did not end when it was asked to.
         last_line: on standard error.
+        alive: a line for each of its processes that lived on then, with what the kernel says that it did.
     """
 
     paused: bool
     exit_code: int | None
     last_line: str
+    alive: list[str] = field(default_factory=list)
 
 
 @check("a fit that takes too long is stopped, with status timeout and nothing half-written", _STAY)
@@ -88,7 +91,8 @@ def signal_faults(stopped: StoppedRun, signum: signal.Signals, out: Path) -> lis
     if not stopped.paused:
         return [f"the fit did not get to its middle: {stopped.last_line or 'it said nothing'}"]
     if stopped.exit_code is None:
-        return ["the run did not end"]
+        alive = f" ({', '.join(stopped.alive)})" if stopped.alive else ""
+        return [f"the run did not end within {_PATIENCE_SECONDS:g} s{alive}: {stopped.last_line or 'it said nothing'}"]
     faults = [] if stopped.exit_code == 128 + signum else [f"exit status {stopped.exit_code}: {stopped.last_line}"]
     return faults + (["there is a submission"] if out.exists() else []) + _debris(out)
 
@@ -164,11 +168,10 @@ def _stop(
             process.send_signal(signum)
         # With a limit of its own, the rest of that limit is still to come.
         patience = _PATIENCE_SECONDS if signum is not None else limit_seconds + _PATIENCE_SECONDS
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(patience)
+        alive = [] if ended(process, patience) else _alive(process.pid)
         lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
         last_line = next((line for line in reversed(lines) if line.strip()), "")
-        return StoppedRun(paused or flag.exists(), process.poll(), last_line[:300])
+        return StoppedRun(paused or flag.exists(), process.poll(), last_line[:300], alive)
     finally:
         if process.poll() is None:  # it does not stop, or the user interrupts the test
             process.send_signal(signal.SIGTERM)
@@ -177,6 +180,30 @@ def _stop(
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+
+
+def ended(process: subprocess.Popen, seconds: float) -> bool:
+    """Whether `process` ended within `seconds` of looking at it; a machine that stands still in between does not count.
+
+    A clock would count a pause of the whole machine, in which the run could not end either.
+    """
+    for _ in range(math.ceil(seconds / _POLL_SECONDS)):
+        if process.poll() is not None:
+            return True
+        time.sleep(_POLL_SECONDS)
+    return process.poll() is not None
+
+
+def _alive(process: int) -> list[str]:
+    """A line for `process` and each below it."""
+    import psutil
+
+    lines = []
+    with contextlib.suppress(psutil.Error):
+        for each in (root := psutil.Process(process), *root.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                lines.append(f"{each.name()} {each.pid} {each.status()}")
+    return lines
 
 
 def as_pairs(overrides: Mapping[str, Any], prefix: str = "") -> list[str]:

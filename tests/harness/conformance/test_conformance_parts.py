@@ -1,8 +1,11 @@
 """Parts of the conformance test: pickles and arrays, openings, and what a stopped run must not leave."""
 
+import itertools
 import pickle
+import re
 import signal
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from splashbench.harness.conformance import model
+from splashbench.harness.conformance import model, stopping
 from splashbench.harness.conformance.recording import OpeningWatch
 from splashbench.harness.conformance.report import Verdict, judge
 from splashbench.harness.conformance.scene_copies import empty_masks, hidden, keep_first_frame
@@ -150,13 +153,33 @@ def test_what_a_stopped_run_must_not_leave(tmp_path: Path) -> None:
     good = StoppedRun(paused=True, exit_code=143, last_line="interrupted")
     assert signal_faults(good, signal.SIGTERM, out) == []
     assert signal_faults(good, signal.SIGINT, out) == ["exit status 143: interrupted"]
-    assert signal_faults(StoppedRun(True, None, ""), signal.SIGINT, out) == ["the run did not end"]
+    hung = StoppedRun(True, None, "", ["python 7 sleeping"])
+    said = ["the run did not end within 20 s (python 7 sleeping): it said nothing"]
+    assert signal_faults(hung, signal.SIGINT, out) == said
     early = StoppedRun(paused=False, exit_code=0, last_line="ok")
     assert signal_faults(early, signal.SIGTERM, out) == ["the fit did not get to its middle: ok"]
     (tmp_path / ".tmp-12345678-submission").mkdir()
     assert signal_faults(good, signal.SIGTERM, out) == [".tmp-12345678-submission was left beside the submission"]
     out.mkdir()
     assert "there is a submission" in signal_faults(good, signal.SIGTERM, out)
+
+
+def test_a_machine_that_stands_still_uses_up_no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that ends at the 50th look, with a minute lost at each of them."""
+    looks, clock = iter([*[None] * 49, 0]), itertools.count(0, 60)
+    process = SimpleNamespace(poll=lambda: next(looks))
+    monkeypatch.setattr(stopping.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(stopping.time, "monotonic", lambda: next(clock))
+    assert stopping.ended(process, 20)
+    assert not stopping.ended(SimpleNamespace(poll=lambda: None), 20)
+
+
+def test_a_run_that_does_not_end_is_named() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        (line,) = stopping._alive(process.pid)
+        assert re.fullmatch(rf"\S+ {process.pid} \w+", line)
+        process.communicate()
+    assert stopping._alive(process.pid) == []
 
 
 def test_settings_go_through_the_command_line_unchanged() -> None:
