@@ -6,6 +6,7 @@ Nothing heavy is imported, since the keeper of a method's process needs it (harn
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import signal
 import sys
@@ -18,6 +19,8 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import subprocess
+
     import psutil
 
 #: In the environment of everything that a watched process starts, with a value of its own for each.
@@ -25,6 +28,7 @@ RUN_MARK = "SPLASHBENCH_RUN"
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36  # linux/prctl.h
 # Until processes that were killed are gone.
 _KILLED_SECONDS, _POLL_SECONDS = 5.0, 0.02
+_LOOK_SECONDS = 0.05
 
 
 class Terminated(KeyboardInterrupt):
@@ -55,6 +59,34 @@ def terminable() -> Iterator[None]:
     finally:
         for number in mine:
             signal.signal(number, signal.SIG_DFL)
+
+
+def has_ended(process: subprocess.Popen) -> bool:
+    """Whether `process` ended, asked so that an exception of a signal's handler does no harm at any point.
+
+    `Popen.poll`, and `Popen.wait` with a timeout, take a lock in one step and see to its release in the next: an
+    exception in between, such as `Terminated`, leaves the lock taken, and the next `wait` never returns.
+    """
+    if process.returncode is not None:
+        return True
+    if not hasattr(os, "waitid"):
+        return process.poll() is not None
+    try:
+        return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+    except ChildProcessError:  # somebody else has waited for it
+        return True
+
+
+def ends_within(process: subprocess.Popen, seconds: float) -> bool:
+    """Whether `process` ends within `seconds` of looking at it; a machine that stands still in between does not count.
+
+    A clock would count a pause of the whole machine, in which the process could not end either.
+    """
+    for _ in range(math.ceil(seconds / _LOOK_SECONDS)):
+        if has_ended(process):
+            return True
+        time.sleep(_LOOK_SECONDS)
+    return has_ended(process)
 
 
 def end_with_parent(parent: int | None = None) -> None:

@@ -15,7 +15,7 @@ from splashbench.child import child_command
 from splashbench.cluster.environment import MARK
 from splashbench.cluster.work import Work
 from splashbench.cluster.worker import serve
-from splashbench.processes import marked_processes
+from splashbench.processes import ends_within, marked_processes
 
 # A worker whose input ends lets its task end for 15 s, and then kills it.
 _STOP_SECONDS = 25.0
@@ -96,9 +96,7 @@ class WorkerProcess:
     def stop(self) -> None:
         """End the worker, and what it carries out; wait until they are gone."""
         self.ask_to_end()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=_STOP_SECONDS)
-        if self._process.poll() != 0:
+        if not ends_within(self._process, _STOP_SECONDS) or self._process.wait() != 0:
             self._process.kill()
             self._process.wait()
             _kill_marked(self._mark)

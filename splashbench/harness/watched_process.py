@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splashbench.processes import RUN_MARK, marked_processes, resident_bytes
+from splashbench.processes import RUN_MARK, ends_within, has_ended, marked_processes, resident_bytes
 from splashbench.progress import Bar
 
 _POLL_SECONDS = 0.05
@@ -91,7 +91,7 @@ def watch(
     reader = ProgressReader(progress)
     last_update, fraction = start, 0.0
     try:
-        while process.poll() is None:
+        while not has_ended(process):
             peak = max(peak, _tree_memory(process.pid, kept))
             report.read()
             for fraction, message in reader.new():
@@ -144,10 +144,9 @@ class _ReportReader:
 
 def _ask_to_end(process: subprocess.Popen) -> None:
     """Let a keeper that runs still end what it keeps, wherever that went, and then itself."""
-    if process.poll() is None:
+    if not has_ended(process):
         process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=_KEEPER_SECONDS)
+        ends_within(process, _KEEPER_SECONDS)
 
 
 def _tree_memory(pid: int, kept: bool) -> int:

@@ -16,6 +16,7 @@ from typing import Any
 from urllib.request import urlopen
 
 from splashbench.errors import SplashbenchError
+from splashbench.processes import ends_within, has_ended
 
 #: Names that the program has.
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -97,7 +98,7 @@ class Browser:
         assert self._process is not None
         written = Path(self._profile.name, "DevToolsActivePort")
         end = time.monotonic() + _START_SECONDS
-        while time.monotonic() < end and self._process.poll() is None:
+        while time.monotonic() < end and not has_ended(self._process):
             lines = written.read_text().splitlines() if written.is_file() else []
             if len(lines) > 1:
                 return int(lines[0])
@@ -113,11 +114,9 @@ class Browser:
             self._socket.close()
         if self._process is not None:
             self._process.terminate()
-            try:
-                self._process.wait(10)
-            except subprocess.TimeoutExpired:
+            if not ends_within(self._process, 10):
                 os.killpg(self._process.pid, signal.SIGKILL)
-                self._process.wait(10)
+            self._process.wait()
         if self._profile is not None:
             self._profile.cleanup()
 

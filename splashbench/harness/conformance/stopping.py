@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import math
 import os
 import signal
 import subprocess
@@ -25,6 +24,7 @@ from splashbench.harness.conformance.evidence import SEED, Evidence, complete_fi
 from splashbench.harness.conformance.report import Judgement, Verdict, check, judge
 from splashbench.harness.contract import Fitted, Method, Run
 from splashbench.harness.discovery import load_method
+from splashbench.processes import ends_within, has_ended
 from splashbench.progress import Bar
 from splashbench.scene import Scene, TrainingScene
 from splashbench.submission import Status, Submission, check_submission
@@ -160,38 +160,25 @@ def _stop(
         )
     start = time.monotonic()
     try:
-        while process.poll() is None and not flag.exists() and time.monotonic() - start < limit_seconds:
+        while not has_ended(process) and not flag.exists() and time.monotonic() - start < limit_seconds:
             time.sleep(_POLL_SECONDS)
             bar.update((time.monotonic() - start) / limit_seconds, "until the middle of the fit")
         paused = flag.exists()
-        if signum is not None and process.poll() is None:
+        if signum is not None and not has_ended(process):
             process.send_signal(signum)
         # With a limit of its own, the rest of that limit is still to come.
         patience = _PATIENCE_SECONDS if signum is not None else limit_seconds + _PATIENCE_SECONDS
-        alive = [] if ended(process, patience) else _alive(process.pid)
+        alive = [] if ends_within(process, patience) else _alive(process.pid)
         lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
         last_line = next((line for line in reversed(lines) if line.strip()), "")
         return StoppedRun(paused or flag.exists(), process.poll(), last_line[:300], alive)
     finally:
-        if process.poll() is None:  # it does not stop, or the user interrupts the test
+        if not has_ended(process):  # it does not stop, or the user interrupts the test
             process.send_signal(signal.SIGTERM)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_KILLED_SECONDS)
+            ends_within(process, _KILLED_SECONDS)
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-
-
-def ended(process: subprocess.Popen, seconds: float) -> bool:
-    """Whether `process` ended within `seconds` of looking at it; a machine that stands still in between does not count.
-
-    A clock would count a pause of the whole machine, in which the run could not end either.
-    """
-    for _ in range(math.ceil(seconds / _POLL_SECONDS)):
-        if process.poll() is not None:
-            return True
-        time.sleep(_POLL_SECONDS)
-    return process.poll() is not None
 
 
 def _alive(process: int) -> list[str]:

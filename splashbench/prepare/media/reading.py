@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from splashbench.child import child_command
 from splashbench.errors import SplashbenchError
+from splashbench.processes import has_ended
 
 from .container import COPY_AGAIN, Chapter, VideoInfo, damaged
 from .messages import EndedError, Message, SilenceError, receive, send
@@ -177,7 +178,7 @@ class _Child:
         self.is_ready = True
 
     def is_alive(self) -> bool:
-        return self._process.poll() is None
+        return not has_ended(self._process)
 
     def how_it_ended(self) -> str:
         """In words, once it says no more."""

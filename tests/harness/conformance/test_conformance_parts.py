@@ -1,6 +1,5 @@
 """Parts of the conformance test: pickles and arrays, openings, and what a stopped run must not leave."""
 
-import itertools
 import pickle
 import re
 import signal
@@ -162,16 +161,6 @@ def test_what_a_stopped_run_must_not_leave(tmp_path: Path) -> None:
     assert signal_faults(good, signal.SIGTERM, out) == [".tmp-12345678-submission was left beside the submission"]
     out.mkdir()
     assert "there is a submission" in signal_faults(good, signal.SIGTERM, out)
-
-
-def test_a_machine_that_stands_still_uses_up_no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that ends at the 50th look, with a minute lost at each of them."""
-    looks, clock = iter([*[None] * 49, 0]), itertools.count(0, 60)
-    process = SimpleNamespace(poll=lambda: next(looks))
-    monkeypatch.setattr(stopping.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr(stopping.time, "monotonic", lambda: next(clock))
-    assert stopping.ended(process, 20)
-    assert not stopping.ended(SimpleNamespace(poll=lambda: None), 20)
 
 
 def test_a_run_that_does_not_end_is_named() -> None:
