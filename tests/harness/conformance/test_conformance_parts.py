@@ -167,7 +167,7 @@ def test_a_run_that_does_not_end_is_named() -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         (line,) = stopping._alive(process.pid)
         assert re.fullmatch(rf"\S+ {process.pid} \w+", line)
-        process.communicate()
+        process.communicate(b"\n")
     assert stopping._alive(process.pid) == []
 
 
