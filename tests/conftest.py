@@ -5,15 +5,21 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
 import pytest
+from filelock import FileLock
 
+from splashbench.files import atomic_directory
 from splashbench.scene import Scene
 from splashbench.study import stress
 from splashbench.synth.balls import write_balls_scene
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell's jobs in the background ignore it, and so would the commands that tests interrupt.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -30,6 +36,23 @@ def _short_reference() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stress, "REFERENCE_SETTINGS", {"iterations": 20})
         yield
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Makes a folder once for all processes that run tests: the first fills it, the others wait; read-only."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        place = shared / name
+        with FileLock(f"{place}.lock"):
+            if not place.is_dir():
+                with atomic_directory(place) as folder:
+                    make(folder)
+        return place
+
+    return made
 
 
 @pytest.fixture(scope="session")

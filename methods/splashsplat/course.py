@@ -27,6 +27,7 @@ from splashbench.parallel import thread_count
 from splashbench.processes import resident_bytes
 from splashbench.render import Frozen, freeze
 from splashbench.scene.scene import TrainingScene
+from splashbench.scene.small_scene import smaller
 from splashbench.selfcalibration import hardly_masked, self_calibration
 
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
@@ -53,6 +54,8 @@ _TRANSPARENT = 0.5
 # Shares of the time that a background takes that comes first, the fit on coarse grids, and everything else before the
 # fine appearance, for the progress bar only.
 _BACKGROUND, _COARSE, _BEFORE = 0.15, 0.2, 0.35
+# Photographs of a draft are smaller than twice this, in pixels: reading large ones takes longer than all else of it.
+_DRAFT_SIDE = 400
 
 
 class Course:
@@ -101,11 +104,14 @@ class Course:
         return self._at_once()
 
     def _draft(self, show: Callable[[Callable[[], State], bool], None]) -> State:
-        run, known = self._run, self._rough_container()
+        run, scene = self._run, smaller(self._scene, _DRAFT_SIDE)
+        plates = self._plates if scene is self._scene else _plates_of(scene)
+        known = self._rough_container(scene, plates)
         run.progress(0, "draft")
         with run.stage("draft"):
-            opaque = self._shows_through() < _TRANSPARENT
-            return make_draft(self._scene, self._config, run.aside(), known, self._plates, opaque, show)
+            shows_through = self._shows_through() if scene is self._scene else transmittance(scene, plates())
+            opaque = shows_through < _TRANSPARENT
+            return make_draft(scene, self._config, run.aside(), known, plates, opaque, show)
 
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
@@ -119,14 +125,14 @@ class Course:
             self._scene, self._known, self._transmittance = found.scene(self._scene), None, None
             self._plates = _plates_of(self._scene)
 
-    def _rough_container(self) -> KnownContainer:
-        """For a draft, which does not wait for what takes the footage longer to tell."""
+    def _rough_container(self, scene: TrainingScene, plates: Callable[[], Plates]) -> KnownContainer:
+        """For a draft of `scene`, which does not wait for what takes the footage longer to tell."""
         asked = False
 
         def roughly() -> Standing:
             nonlocal asked
             asked = True
-            return standing_roughly(self._scene, self._plates())
+            return standing_roughly(scene, plates())
 
         known = self._look_for_container(roughly)
         if not asked:

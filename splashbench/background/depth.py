@@ -43,13 +43,15 @@ class DepthMap:
     """What the sweep says of one view, at the sweep's size.
 
     camera: the view at that size. inverse: float32 [H, W], inverse depth. trusted: bool [H, W], where another view's
-    sweep agrees. covered: bool [H, W], where some view's trusted pixels project.
+    sweep agrees. covered: bool [H, W], where some view's trusted pixels project. cost: float32 [H, W], how much colours
+    of views differ there, as a share of full scale.
     """
 
     camera: Camera
     inverse: NDArray[np.float32]
     trusted: NDArray[np.bool_]
     covered: NDArray[np.bool_]
+    cost: NDArray[np.float32]
 
     def lifted(self) -> NDArray[np.float64]:
         """World points of all pixels, [H, W, 3]."""
@@ -82,8 +84,8 @@ def depth_maps(points: NDArray[np.float32] | None, plates: list[CleanPlate]) -> 
     low, high = _inverse_range(priors, cameras)
     maps = []
     for view, plate in enumerate(plates):
-        inverse = inverse_depth(view, plates, low, high, priors[view])
-        maps.append(DepthMap(plate.camera, inverse, np.zeros_like(plate.seen), np.zeros_like(plate.seen)))
+        inverse, cost = inverse_depth(view, plates, low, high, priors[view])
+        maps.append(DepthMap(plate.camera, inverse, np.zeros_like(plate.seen), np.zeros_like(plate.seen), cost))
     clouds = [depth.lifted() for depth in maps]
     for depth, plate, cloud in zip(maps, plates, clouds):
         others = [other for other in maps if other is not depth]

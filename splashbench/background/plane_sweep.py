@@ -32,8 +32,11 @@ Map = NDArray[np.float32]
 _MEAN_COLOR = np.array([[1, 1, 1, 0]], np.float32) / 3
 
 
-def inverse_depth(reference: int, plates: list[CleanPlate], low: float, high: float, prior: Map | None) -> Map:
-    """Inverse depth [H, W] of plate number `reference`, looked for between `low` and `high`.
+def inverse_depth(
+    reference: int, plates: list[CleanPlate], low: float, high: float, prior: Map | None
+) -> tuple[Map, Map]:
+    """Inverse depth [H, W] of plate number `reference`, looked for between `low` and `high`; and how much the colours
+    of the two views that agree best differ there, [H, W], in the mean of the pixels around, as a share of full scale.
 
     prior: [H, W] inverse depths that break ties where the images say little, or None.
     """
@@ -57,8 +60,8 @@ def inverse_depth(reference: int, plates: list[CleanPlate], low: float, high: fl
         guide.filter(cost, volume[k])
     inverse, cost = _minimum(volume, planes)
     if prior is None:
-        return inverse
-    return np.where(_costs_at(volume, planes, prior) < cost + _INDISTINCT, prior, inverse)
+        return inverse, cost
+    return np.where(_costs_at(volume, planes, prior) < cost + _INDISTINCT, prior, inverse), cost
 
 
 def _difference(image: Map, source: Map, homography: NDArray[np.float64]) -> Map:

@@ -27,7 +27,7 @@ from splashbench.container.body_search import BEND, CIRCULAR, HEIGHT, MESH_RINGS
 from splashbench.container.found_vessel import LEAST_HELD, FoundVessel
 from splashbench.container.outline_search import BLURS, OutlineSearch
 from splashbench.container.pool_vessel import vessel_about_pool
-from splashbench.container.standing import ContainerView, Place, place_about_liquid
+from splashbench.container.standing import ContainerView, Place, place_about_liquid, shows_enough
 from splashbench.scene.scene import TrainingScene
 
 # What is held by depth counts so much beside edges: it keeps outlines off those that are painted on the container.
@@ -59,6 +59,9 @@ def standing_about_liquid(scene: TrainingScene, plates: Mapping[str, CleanPlate]
     if vessel is None or not vessel.trusted:
         clear = vessel_about_pool(scene, place, plates)
         vessel = clear if clear is not None and clear.trusted else vessel or clear
+    if vessel is not None and not vessel.trusted and (sure := _without_doubtful(views)):
+        again = _ByDepth(place, sure).at_edges()
+        vessel = again if again.trusted else vessel
     return Standing(place.support, vessel)
 
 
@@ -69,6 +72,12 @@ def standing_roughly(scene: TrainingScene, plates: Mapping[str, CleanPlate]) -> 
     if place is None:
         return Standing(None, None)
     return Standing(place.support, _ByDepth(place, views).roughly() if views else None)
+
+
+def _without_doubtful(views: Sequence[ContainerView]) -> list[ContainerView]:
+    """What `views` show for sure; nothing where one of them shows too little of it."""
+    sure = [view.without_doubtful() for view in views]
+    return sure if all(shows_enough(view.says) for view in sure) else []
 
 
 class _ByDepth:

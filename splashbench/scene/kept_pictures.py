@@ -14,10 +14,11 @@ Pixels = TypeVar("Pixels", bound=np.ndarray[Any, Any])
 
 
 class KeptPictures:
-    """What was read of a scene whose photographs and masks take `total` bytes, for whoever asks again."""
+    """What was read of a scene whose photographs and masks take `total` bytes, for whoever asks again; nothing where
+    that is more than `most`."""
 
-    def __init__(self, total: int) -> None:
-        self._pictures: dict[tuple[str, str, int], Any] | None = {} if total <= MAX_KEPT_BYTES else None
+    def __init__(self, total: int, most: int = MAX_KEPT_BYTES) -> None:
+        self._pictures: dict[tuple[str, str, int], Any] | None = {} if total <= most else None
 
     def get(self, kind: str, camera: str, t: int, read: Callable[[str, int], Pixels]) -> Pixels:
         """What `read` gave for `camera` at timestep `t` the first time; the caller may change the array."""

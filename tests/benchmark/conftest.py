@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,21 +21,26 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def real(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """The folder of the scenes; read-only."""
-    place = tmp_path_factory.mktemp("real")
-    write_release(place / "given.zip", imitations(NAMES))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SPLASHBENCH_CACHE", str(place / "cache"))
-        download_scenes(place / "scenes", NAMES, ("full", "crop"), place / "given.zip", tell=lambda line: None)
-    return place / "scenes"
+
+    def make(place: Path) -> None:
+        write_release(place / "given.zip", imitations(NAMES))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("SPLASHBENCH_CACHE", str(place / "cache"))
+            download_scenes(place / "scenes", NAMES, ("full", "crop"), place / "given.zip", tell=lambda line: None)
+
+    return once("benchmark_scenes", make) / "scenes"
 
 
 @pytest.fixture(scope="session")
-def made(real: Path, _short_reference: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(real: Path, _short_reference: None, once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A benchmark that was run whole; read-only."""
-    out = tmp_path_factory.mktemp("made") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SPLASHBENCH_CACHE", str(out.parent / "cache"))
-        assert main(["benchmark", "run", str(out), "--scenes", str(real), "--methods", GREY, "nearest_camera"]) == 0
-    return out
+
+    def make(place: Path) -> None:
+        words = ["benchmark", "run", str(place / "out"), "--scenes", str(real), "--methods", GREY, "nearest_camera"]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("SPLASHBENCH_CACHE", str(place / "cache"))
+            assert main(words) == 0
+
+    return once("benchmark_made", make) / "out"

@@ -103,6 +103,7 @@ def test_on_many_machines_the_estimate_is_of_one_run_at_a_time(
     )
 
 
+@pytest.mark.slow
 def test_what_it_does_on_ray_it_does_here(made: Path, real: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="comes with the extra [cluster]")
     scene = str(find_scenes([str(real)])[0])

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 
 from splashbench.background.clean_plate import make_clean_plates
 from splashbench.background.support import find_support
+from splashbench.container import footage_vessel
 from splashbench.container.footage_vessel import Standing, standing_about_liquid, standing_roughly
 from splashbench.container.pool_vessel import pool_views
-from splashbench.container.standing import place_about_liquid
+from splashbench.container.standing import ContainerView, place_about_liquid
 from splashbench.container.verification import silhouette
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
@@ -79,6 +81,32 @@ def test_a_rough_one_is_there_before_edges_are_looked_at(speckled: Path) -> None
     assert min(covers(roughly, bowl(), speckled)) > 0.75
 
 
+@pytest.mark.parametrize("told", [False, True])
+def test_pixels_that_other_views_contradict_have_no_say(
+    speckled: Path, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As beside a bowl in narrow images, where no other view shows the floor: a rim of wrong depths."""
+    scene = Scene.open(speckled).training()
+    plates = make_clean_plates(scene)
+    place, views = place_about_liquid(scene, plates)
+
+    def with_rim(view: ContainerView) -> ContainerView:
+        shown = view.says > 0
+        rim = (ndimage.binary_dilation(shown, iterations=9) & ~shown).astype(bool)
+        says = np.where(rim, np.int8(1), view.says)
+        points = np.empty((*says.shape, 3))
+        points[shown], points[rim] = view.points, view.points.mean(axis=0)
+        return replace(view, says=says, points=points[says > 0], doubtful=rim if told else np.zeros_like(rim))
+
+    wrong = [with_rim(view) for view in views]
+    monkeypatch.setattr(footage_vessel, "place_about_liquid", lambda *_: (place, wrong))
+    found = standing_about_liquid(scene, plates)
+    assert found.vessel is not None
+    assert found.vessel.trusted is told
+    if told:
+        assert min(covers(found, bowl(), speckled)) > 0.975
+
+
 def test_a_box_is_found_too(tmp_path: Path) -> None:
     directory = write_painted_scene(tmp_path / "scene", SPECKLED, trough(), masked=False)
     found = standing(directory)
@@ -131,6 +159,7 @@ def test_glass_is_found_about_liquid_that_rests_in_it(tmp_path: Path) -> None:
     assert pool_views(brief, place, plates) == []
 
 
+@pytest.mark.slow
 def test_a_puddle_has_no_glass_about_it(tmp_path: Path) -> None:
     scene = Scene.open(write_glass_scene(tmp_path / "puddle", edges=False)).training()
     plates = make_clean_plates(scene)

@@ -65,6 +65,7 @@ def test_two_methods_compared(tmp_path: Path) -> None:
     assert "nothing" in board
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_and_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib
 

@@ -18,6 +18,8 @@ from splashbench.scene import Scene
 from splashbench.submission import Submission, seal
 from splashbench_methods.splashsplat.method import SplashSplat
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = toml.load(Path(__file__).parent / "small_fits.toml")["splashsplat"]
 

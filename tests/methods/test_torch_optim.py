@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from splashbench import toml
 from splashbench.harness.discovery import load_method
 
@@ -31,6 +33,7 @@ for name, settings in json.loads(sys.argv[2]).items():
 """
 
 
+@pytest.mark.slow
 def test_a_fit_loads_the_compiler_only_where_its_method_says_so(balls_directory: Path) -> None:
     without = {name: settings for name, settings in SETTINGS.items() if not load_method(name).torch_optim}
     assert {"splashsplat", "scaffold_4d", "spacetime_gaussians", "nothing"} <= set(without)

@@ -143,6 +143,7 @@ def test_a_method_that_is_not_installed_shows_its_stored_views(copy: Path, balls
         splashbench.load(copy, method="splashsplat")
 
 
+@pytest.mark.slow
 def test_a_fit_to_some_timesteps_is_opened_with_those(balls_directory: Path, tmp_path: Path, balls: Scene) -> None:
     out = tmp_path / "withheld"
     run_method("splashsplat", balls_directory, out, preset="quick", overrides=FEW, timing_frames=0, withheld="odd")

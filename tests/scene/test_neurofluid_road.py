@@ -118,6 +118,7 @@ def test_the_background_of_the_preset_paper_starts_from_hull_points_and_is_white
     assert image[~scene.mask(view, 0)].mean() > 0.97
 
 
+@pytest.mark.slow
 def test_the_preset_paper_of_splashsplat_fits_a_scene_without_sparse_points(
     watersphere: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,6 +133,7 @@ def test_the_preset_paper_of_splashsplat_fits_a_scene_without_sparse_points(
     assert render.alpha[mask].mean() > 0.5 > 0.1 > render.alpha[~mask].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["splashsplat", "scaffold_4d"])
 def test_a_fit_does_not_see_the_test_view(method: str, watersphere: Path, tmp_path: Path) -> None:
     """One file has a view's picture and its mask: those of view 5, and its particles, are cut short here."""

@@ -73,9 +73,9 @@ def test_a_turned_camera_is_found_and_the_others_stay(tracks: Tracks, cameras: C
     ("kind", "other", "share"),
     [
         ("shifted", lambda camera: with_intrinsics(camera, shift=3.0), 0.15),
-        ("longer", lambda camera: with_intrinsics(camera, focal=1.03), 0.15),
+        pytest.param("longer", lambda camera: with_intrinsics(camera, focal=1.03), 0.15, marks=pytest.mark.slow),
         # All cameras may have moved a little instead: what is found of one is about two thirds.
-        ("moved", lambda camera: moved(camera, 0.03), 0.45),
+        pytest.param("moved", lambda camera: moved(camera, 0.03), 0.45, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_wrong_with_a_camera_is_told_apart_and_undone(

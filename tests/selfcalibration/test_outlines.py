@@ -140,6 +140,7 @@ def test_cameras_that_are_not_named_stay(cameras: dict[str, Camera]) -> None:
     assert examined(footage(cameras, eroded), ()).outlines == {}
 
 
+@pytest.mark.slow
 def test_where_photographs_show_no_liquid_masks_stay(cameras: dict[str, Camera]) -> None:
     """Liquid that looks like what is behind it."""
     still = {name: photograph(camera) for name, camera in cameras.items()}

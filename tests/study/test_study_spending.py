@@ -67,6 +67,7 @@ def test_without_time_the_recordings_as_they_are_remain(balls_directory: Path, t
     assert main([*command, "--budget", "5", "--json"]) == 0
 
 
+@pytest.mark.slow
 def test_a_budget_makes_all_runs_where_there_is_time(
     balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

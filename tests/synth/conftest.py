@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,11 +14,14 @@ SMALL = RecordingOptions(size=(128, 72), fps=20, seed=3, duration=0.7, particle_
 
 
 @pytest.fixture(scope="session")
-def small_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_session(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A whole session of tiny frames and coarse liquid."""
     for module in ("pysplishsplash", "pysplashsurf", "embreex"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed (splashbench[synth])")
     from splashbench.synth.recording.session import make_session
 
-    return make_session(tmp_path_factory.mktemp("synth") / "session", SMALL)
+    def make(folder: Path) -> None:
+        make_session(folder / "session", SMALL)
+
+    return once("synth_session", make) / "session"

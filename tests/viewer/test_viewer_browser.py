@@ -150,6 +150,7 @@ def test_it_draws_the_fit_and_follows_the_clock(session: Session) -> None:
     assert differ(session.picture(), first) < moved / 4
 
 
+@pytest.mark.slow
 def test_boxes_take_layers_away_and_bring_them_back(session: Session) -> None:
     before = session.picture()
     for box in ("liquid", "background"):

@@ -85,6 +85,7 @@ def test_the_other_codes_take_the_same_road(
     assert picture.std() > 5  # something is drawn
 
 
+@pytest.mark.slow
 def test_a_model_that_was_trained_before_is_imported_without_a_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

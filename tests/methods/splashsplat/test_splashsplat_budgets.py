@@ -54,6 +54,7 @@ def test_bytes_are_kept_by_coarser_grids_fewer_carriers_and_longer_steps(balls: 
     assert sizes[1] < sizes[0]
 
 
+@pytest.mark.slow
 def test_a_budget_that_nothing_exceeds_changes_nothing(balls: Scene) -> None:
     free, _ = fit(balls, Budget())
     roomy, run = fit(balls, Budget(storage_bytes=10**9))
@@ -178,6 +179,7 @@ def test_carriers_of_no_liquid_are_no_trouble(balls: Scene) -> None:
     assert trace.asked[-1] > 128
 
 
+@pytest.mark.slow
 def test_a_fit_within_memory_has_the_grids_that_it_leaves_room_for(balls: Scene) -> None:
     free, _ = fit(balls, Budget())
     roomy, run = fit(balls, Budget(memory_bytes=10**12))

@@ -128,8 +128,15 @@ def on_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 TRANSPARENT = pytest.mark.parametrize("share", [0.0, 1.0])
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@TRANSPARENT
+@pytest.mark.parametrize(
+    ("share", "threads"),
+    [
+        (0.0, 1),
+        (1.0, 2),
+        pytest.param(0.0, 2, marks=pytest.mark.slow),
+        pytest.param(1.0, 1, marks=pytest.mark.slow),
+    ],
+)
 def test_who_looks_on_changes_nothing(
     share: float, threads: int, balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -317,3 +324,26 @@ def test_there_is_none_where_something_else_ends_the_fit(
 ) -> None:
     fitted(balls, Run(budget=budget), iterations=12, **settings)
     assert coarse_fits == []
+
+
+def test_a_draft_of_large_photographs_sees_small_ones_and_the_fit_is_the_same(
+    balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(smaller, "_DRAFT_ITERATIONS", 20)
+    seen: list[TrainingScene] = []
+    made = course.make_draft
+
+    def make_draft(scene: TrainingScene, *others: Any) -> Any:
+        seen.append(scene)
+        return made(scene, *others)
+
+    monkeypatch.setattr(course, "make_draft", make_draft)
+    images = []
+    for side in (400, 48):
+        monkeypatch.setattr(course, "_DRAFT_SIDE", side)
+        run = Run()
+        run._checkpoints = Checkpoints(tmp_path / str(side), [0.0, 1e9], lambda: 7.0, lambda: None)
+        found = fitted(balls, run, iterations=40, draft_cells=32)
+        images.append(found.render(balls.cameras["6"], float(balls.times[3])).rgb)
+    assert [scene.cameras["1"].width for scene in seen] == [96, 48]
+    np.testing.assert_array_equal(*images)

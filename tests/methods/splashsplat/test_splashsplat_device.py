@@ -118,9 +118,13 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "auto": ("auto", ALONE | {"iterations": 120}),
     "paper": ("paper", {"children": 2, "draft_cells": 0}),
 }
+#: What `make test` has time for: what most fits are, and how they are stored.
+_QUICK = ("best", "storing")
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[] if case in _QUICK else [pytest.mark.slow]) for case in CASES]
+)
 def test_a_fit_there_is_the_cpus(
     case: str,
     balls: Scene,

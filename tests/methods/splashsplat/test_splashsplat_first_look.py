@@ -169,6 +169,7 @@ def test_no_draft_where_none_is_asked_for(balls: Scene, tmp_path: Path) -> None:
     assert "draft" not in run.stages
 
 
+@pytest.mark.slow
 def test_the_background_comes_after_the_first_iterations(
     balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

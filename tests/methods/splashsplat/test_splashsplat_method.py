@@ -273,6 +273,7 @@ def test_the_same_seed_gives_the_same_liquid_bit_for_bit(balls: Scene):
     assert not torch.equal(first.appearance.features[:100], other.appearance.features[:100])
 
 
+@pytest.mark.slow
 def test_the_ablations_differ_as_the_paper_says(balls: Scene):
     full = liquid_only(balls, prune_opacity=0)
     alone = liquid_only(balls, prune_opacity=0, variant="no_resampling")
@@ -284,6 +285,7 @@ def test_the_ablations_differ_as_the_paper_says(balls: Scene):
     assert (anew.motion.velocities == 0).all()
 
 
+@pytest.mark.slow
 def test_transparent_carriers_are_dropped(balls: Scene):
     kept = liquid_only(balls, prune_opacity=0, iterations=0)
     opacity = kept.appearance.decoder.mean_opacity(kept.appearance.features).detach()

@@ -1,5 +1,6 @@
 """Observation fields shared by the runs of a study: the same to the last bit, by what they depend on."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,14 @@ def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path
     assert "failed masks" not in second.stages
 
 
+@pytest.fixture(scope="module")
+def stored(balls: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a run with the settings of `SMALL` stores."""
+    folder = tmp_path_factory.mktemp("stored")
+    _observed(balls, Run(cache=folder))
+    return folder
+
+
 @pytest.mark.parametrize(
     ("settings", "taken_over"),
     [
@@ -73,10 +82,9 @@ def test_shared_or_not_the_fields_are_the_same_bits(balls: Scene, tmp_path: Path
     ],
 )
 def test_another_run_takes_over_what_its_settings_leave_as_it_was(
-    balls: Scene, tmp_path: Path, settings: dict[str, object], taken_over: list[str]
+    balls: Scene, stored: Path, tmp_path: Path, settings: dict[str, object], taken_over: list[str]
 ) -> None:
-    _observed(balls, Run(cache=tmp_path))
-    run = Run(cache=tmp_path)
+    run = Run(cache=shutil.copytree(stored, tmp_path / "cache"))
     _, shared = _observed(balls, run, **settings)
     assert list(run.reused) == taken_over
     _, alone = _observed(balls, Run(), **settings)

@@ -57,6 +57,7 @@ def carriers(directory: Path) -> float:
     return float(np.mean([trace_liquid(training, config, Run(seed=seed)).track.carriers.count for seed in range(4)]))
 
 
+@pytest.mark.slow
 def test_a_recording_with_every_frame_twice_buys_nothing(doubled: Path, balls_directory: Path) -> None:
     once, _ = fit(balls_directory)
     twice, run = fit(doubled)

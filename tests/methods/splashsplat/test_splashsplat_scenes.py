@@ -121,6 +121,7 @@ def test_a_scene_without_masks_that_nobody_may_look_for_is_refused(balls_copy: P
         SplashSplat().fit(training, SplashSplatConfig.preset("quick", TINY | {"self_calibration": False}), Run(seed=0))
 
 
+@pytest.mark.slow
 def test_liquid_that_no_mask_shows_is_fitted_by_what_changes(balls: Scene, balls_copy: Path, tmp_path: Path):
     set_masks(balls_copy, 0, ("1", "2", "3", "4", "5"), range(8))
     config = SplashSplatConfig.preset("quick", TINY | {"background_preset": "quick"})

@@ -118,6 +118,7 @@ def fitted(scene: Scene, **overrides: object) -> list[float]:
     return told
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_soon_explained_is_soon_fitted(many_balls: Scene, monkeypatch: pytest.MonkeyPatch):
     looks: list[tuple[int, float]] = []
     look = AdaptiveSchedule.look

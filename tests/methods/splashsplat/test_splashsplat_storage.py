@@ -75,6 +75,7 @@ def test_storing_what_was_loaded_gives_the_same_bytes(fitted: tuple[FittedSplash
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_rounding_is_within_the_tolerance_and_a_wider_one_takes_fewer_bytes(balls: Scene) -> None:
     sizes = []
     for tolerance in (0.001, 0.03, 0.3):

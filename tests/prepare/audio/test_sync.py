@@ -98,6 +98,7 @@ def test_six_seconds_with_a_clap_and_pouring_are_known_to_half_a_millisecond(see
         assert worst_error(fits[camera], start, clock_rate, 6) < 0.5e-3
 
 
+@pytest.mark.slow
 def test_a_minute_with_the_papers_drifts_at_10_decibels() -> None:
     """Supp. "Capture Setup": two cameras drift by -49 and -81 us/s."""
     emitted = sources(9, 60, pour=(2, 59))

@@ -210,6 +210,7 @@ def test_a_board_that_is_carried_for_some_cameras_is_told(with_extrinsics: Path)
     assert "#   cam2/extrinsics/GX010004.MP4" in (with_extrinsics / "session.toml").read_text()
 
 
+@pytest.mark.slow
 def test_a_checkerboard_that_looks_alike_after_a_half_turn_places_nothing(tmp_path: Path) -> None:
     from splashbench.prepare.session import Session
 

@@ -97,6 +97,7 @@ def test_cameras_come_out_where_they_stand_in_metres() -> None:
     np.testing.assert_allclose(exact.w2c["1"], np.eye(4), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_misread_boards_do_not_bend_the_rig() -> None:
     truth = rig()
     sightings = truth.sightings(np.random.default_rng(2))

@@ -11,6 +11,7 @@ import pytest
 from study_process import deterministic_results, entries, marked, running, start_study, study, wait_for, write_spec
 
 
+@pytest.mark.slow  # tests/study/test_study_command.py kills a smaller one
 def test_the_same_command_goes_on_after_a_kill(
     place: list[str], balls_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
