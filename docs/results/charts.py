@@ -351,6 +351,32 @@ def whole_fit() -> Figure:
     return figure
 
 
+def whole_fit_told_nothing() -> Figure:
+    rows = read(HERE / "data" / "whole_fit_told_nothing.csv")
+    figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+    places = figure.subplots(1, 2)
+    marks = (
+        ("hull_points", "x", GREY, "none"),
+        ("spacetime_gaussians", "s", GREY, "-"),
+        ("scaffold_4d", "D", BLUE, "-"),
+        ("splashsplat 28", "o", VERMILION, ":"),
+        ("splashsplat", "o", VERMILION, "-"),
+    )
+    for place, (metric, title) in zip(places, (("psnr", "PSNR of the liquid, dB"), ("miou", "mIoU"))):
+        for name, marker, color, line in marks:
+            points = [(float(row["seconds"]), float(row[metric])) for row in rows if row["method"] == name]
+            place.step(*zip(*points), where="post", color=color, lw=1.4, ls=line)
+            place.plot(*zip(*points), marker, color=color, mfc="white", ms=4, label=name)
+        place.set_xscale("log")
+        ticks = (30, 60, 120, 300, 600, 1800)
+        place.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
+        place.set_xticks([], minor=True)
+        place.set_xlabel("seconds of the fit at 1200x1800")
+        place.set_title(title)
+    legend(places[-1])
+    return figure
+
+
 IMAGES = (("psnr", "PSNR, dB"), ("miou", "mIoU"))
 CHARTS: dict[str, Callable[[], Figure]] = {
     "psnr_by_scene": psnr_by_scene,
@@ -373,6 +399,7 @@ CHARTS: dict[str, Callable[[], Figure]] = {
     "quality_over_time_600x400": partial(quality_over_time, "quality_over_time_600x400"),
     "capacity": capacity,
     "whole_fit": whole_fit,
+    "whole_fit_told_nothing": whole_fit_told_nothing,
 }
 
 

@@ -191,6 +191,20 @@ def test_leads_over_time_are_those_of_the_committed_results() -> None:
         assert float(share.removesuffix(" %")) == pytest.approx(100 * leads[at, "share"][1], abs=0.51)
 
 
+def test_states_of_a_large_fit_are_what_was_measured() -> None:
+    with (RESULTS / "data" / "whole_fit_told_nothing.csv").open(encoding="utf-8", newline="") as file:
+        measured = list(csv.DictReader(file))
+    header, _, *lines = first_table("whole_fit.md")
+    assert {row["method"] for row in measured} == set(header[1:])
+    assert [line[0] for line in lines] == ["60 s", "120 s", "300 s", "600 s", "the end"]
+    for moment, *cells in lines:
+        until = float("inf") if moment == "the end" else float(moment.removesuffix(" s"))
+        for method, cell in zip(header[1:], cells, strict=True):
+            shown = [row for row in measured if row["method"] == method and float(row["seconds"]) <= until]
+            told = [] if cell == "–" else [float(part.strip(" *†")) for part in cell.split("/")]
+            assert told == ([float(shown[-1]["psnr"]), float(shown[-1]["miou"])] if shown else [])
+
+
 def test_told_all_is_what_was_measured() -> None:
     measured, table = told_nothing(), tables("told_nothing.md")[4]
     scenes = table[0][1:-1]
