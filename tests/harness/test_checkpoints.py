@@ -2,6 +2,8 @@
 
 import json
 import random
+import runpy
+import sys
 import time as clock
 from pathlib import Path
 from typing import ClassVar
@@ -165,6 +167,25 @@ def test_every_state_is_scored(submission: Submission, balls: Scene, tmp_path: P
     assert result.checkpoints[0].metrics["lpips"] is None
     assert result.checkpoints[0].metrics.keys() < result.metrics.keys()
     assert Result.load(result.save(tmp_path)) == result
+
+
+def test_states_are_told_by_psnr_and_miou_alone_as_they_are_scored(
+    submission: Submission, balls: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """benchmarks/states.py, for large scenes: with all frames, to what a table shows, as `score`."""
+    script = Path(__file__).resolve().parents[2] / "benchmarks" / "states.py"
+    words = [str(script), str(submission.directory), "--scene", str(balls.directory), "--every", "1"]
+    monkeypatch.setattr(sys, "argv", [*words, "--out", str(tmp_path / "states.csv")])
+    assert runpy.run_path(str(script))["main"]() == 0
+    header, *rows = [line.split(",") for line in (tmp_path / "states.csv").read_text().splitlines()]
+    assert header == ["method", "seconds", "psnr", "miou"]
+    result = score_submission(balls, submission)
+    states = [state.metrics for state in result.checkpoints]
+    states.append({name: result.value(name) for name in ("psnr", "miou")})
+    assert len(rows) == len(states)
+    for row, state in zip(rows, states):
+        assert float(row[2]) == pytest.approx(state["psnr"], abs=0.0051)
+        assert float(row[3]) == pytest.approx(state["miou"], abs=0.00051)
 
 
 def test_a_state_scores_as_a_run_that_ended_there(submission: Submission, balls: Scene, tmp_path: Path) -> None:
