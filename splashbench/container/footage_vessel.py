@@ -37,6 +37,9 @@ _PUSHES = (0.08, -0.08)
 # Pixels along the longer side of plates that do for a rough look. What depths show of plain bowls is so many pixels
 # wider than these are; of strongly textured ones it is not, and what is found of them is too narrow.
 _ROUGH_SIDE, _WIDER = 160, 2.0
+# What a rough vessel holds where depths are right: .96 to .97 of bowls in wide images. In upright ones, where what is
+# doubtful makes it too wide, it held .90 to .96.
+_ROUGHLY_HELD = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,12 @@ def standing_roughly(scene: TrainingScene, plates: Mapping[str, CleanPlate]) -> 
     place, views = place_about_liquid(scene, {name: shrunk(plate, _ROUGH_SIDE) for name, plate in plates.items()})
     if place is None:
         return Standing(None, None)
-    return Standing(place.support, _ByDepth(place, views).roughly() if views else None)
+    if not views:
+        return Standing(place.support, None)
+    vessel = _ByDepth(place, views).roughly()
+    if vessel.held[0] < _ROUGHLY_HELD and (sure := _without_doubtful(views)):
+        vessel = max(vessel, _ByDepth(place, sure).roughly(), key=lambda found: found.held[0])
+    return Standing(place.support, vessel)
 
 
 def _without_doubtful(views: Sequence[ContainerView]) -> list[ContainerView]:

@@ -105,6 +105,8 @@ def test_pixels_that_other_views_contradict_have_no_say(
     assert found.vessel.trusted is told
     if told:
         assert min(covers(found, bowl(), speckled)) > 0.975
+    roughly = standing_roughly(scene, plates)
+    assert (min(covers(roughly, bowl(), speckled)) > 0.85) is told
 
 
 def test_a_box_is_found_too(tmp_path: Path) -> None:
