@@ -54,7 +54,7 @@ _TRANSPARENT = 0.5
 # Shares of the time that a background takes that comes first, the fit on coarse grids, and everything else before the
 # fine appearance, for the progress bar only.
 _BACKGROUND, _COARSE, _BEFORE = 0.15, 0.2, 0.35
-# Photographs of a draft are smaller than twice this, in pixels: reading large ones takes longer than all else of it.
+# Photographs of a draft are smaller than twice this, in pixels: large ones took it two minutes.
 _DRAFT_SIDE = 400
 
 
