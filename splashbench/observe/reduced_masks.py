@@ -6,12 +6,9 @@ images are time spent on nothing: the masks are averaged over squares of pixels 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from splashbench.observe.silhouettes import ImageWindow, MaskedScene
-from splashbench.scene.camera import Camera
 
 #: pixels per voxel that are kept, at least
 PIXELS_PER_VOXEL = 2.0
@@ -26,7 +23,7 @@ class ReducedScene:
     def __init__(self, scene: MaskedScene, factor: int) -> None:
         self._scene, self.factor = scene, factor
         self.name, self.train, self.n_frames = scene.name, scene.train, scene.n_frames
-        self.cameras = {name: _reduced(camera, factor) for name, camera in scene.cameras.items()}
+        self.cameras = {name: camera.binned(factor) for name, camera in scene.cameras.items()}
         # What `Silhouettes` looks for in scenes whose cameras have times of their own.
         self.times = getattr(scene, "times", None)
         self.camera_times = getattr(scene, "camera_times", {})
@@ -38,11 +35,6 @@ class ReducedScene:
         beyond = view.height * factor - mask.shape[0], view.width * factor - mask.shape[1]
         squares = np.pad(mask, ((0, beyond[0]), (0, beyond[1]))).reshape(view.height, factor, view.width, factor)
         return np.count_nonzero(squares, axis=(1, 3)) >= factor
-
-
-def _reduced(camera: Camera, factor: int) -> Camera:
-    K = np.diag([1 / factor, 1 / factor, 1.0]) @ camera.K
-    return replace(camera, width=-(-camera.width // factor), height=-(-camera.height // factor), K=K)
 
 
 def reduction(scene: MaskedScene, cells: int) -> int:

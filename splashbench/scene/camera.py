@@ -70,6 +70,12 @@ class Camera:
         K[1, 2] -= y0
         return replace(self, width=width, height=height, K=K)
 
+    def binned(self, factor: int) -> Camera:
+        """The camera whose pixels are squares of `factor` by `factor` of these; at the edges what there is of a square
+        counts as a whole one."""
+        K = np.diag([1 / factor, 1 / factor, 1.0]) @ self.K
+        return replace(self, width=-(-self.width // factor), height=-(-self.height // factor), K=K)
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the image resized by `factor`; sizes are rounded, K scaled by the true ratios per axis."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))

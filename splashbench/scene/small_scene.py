@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.scene.camera import Camera
 from splashbench.scene.kept_pictures import KeptPictures
 from splashbench.scene.scene import TrainingScene
 
@@ -30,7 +27,7 @@ class SmallScene(TrainingScene):
     def __init__(self, scene: TrainingScene, factor: int) -> None:
         super().__init__(scene._scene)
         self._large, self._factor = scene, factor
-        self.cameras = {name: _shrunk(camera, factor) for name, camera in scene.cameras.items()}
+        self.cameras = {name: camera.binned(factor) for name, camera in scene.cameras.items()}
         self.camera_times = scene.camera_times
         pixels = sum(camera.width * camera.height for camera in self.cameras.values())
         self._pictures = KeptPictures(4 * pixels * self.n_frames, MAX_KEPT_BYTES)
@@ -62,8 +59,3 @@ class SmallScene(TrainingScene):
 
     def _mostly(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.asarray(self._mean(np.where(mask, np.uint8(255), np.uint8(0))) > 127)
-
-
-def _shrunk(camera: Camera, factor: int) -> Camera:
-    K = np.diag([1 / factor, 1 / factor, 1.0]) @ camera.K
-    return replace(camera, width=-(-camera.width // factor), height=-(-camera.height // factor), K=K)

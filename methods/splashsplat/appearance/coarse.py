@@ -16,7 +16,6 @@ from torch.nn.functional import pad
 
 from splashbench.gaussians.devices import CPU
 from splashbench.parallel import each
-from splashbench.scene.camera import Camera
 
 from ..kernel.window_loss import WindowPhotograph
 from .photographs import Deferred, Photograph, Shelf, read_now
@@ -84,7 +83,7 @@ def half_size(
     photograph: of that size, see `halved_photograph`. background, wall: of the whole image at that size, or [3] and
     None.
     """
-    camera = _half(target.camera)
+    camera = target.camera.binned(2)
     x, y = (at // 2 for at in target.corner)
     window = slice(y, y + camera.height), slice(x, x + camera.width)
     return replace(
@@ -121,12 +120,6 @@ def halved_photograph(photograph: WindowPhotograph) -> WindowPhotograph:
         top=photograph.top // 2,
         left=photograph.left // 2,
     )
-
-
-def _half(camera: Camera) -> Camera:
-    """`camera` with pixels twice as large; an odd last row or column becomes a whole one."""
-    K = np.diag([0.5, 0.5, 1.0]) @ camera.K
-    return replace(camera, width=(camera.width + 1) // 2, height=(camera.height + 1) // 2, K=K)
 
 
 def _halved(image: Tensor) -> Tensor:
