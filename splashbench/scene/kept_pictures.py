@@ -15,10 +15,11 @@ Pixels = TypeVar("Pixels", bound=np.ndarray[Any, Any])
 
 class KeptPictures:
     """What was read of a scene whose photographs and masks take `total` bytes, for whoever asks again; nothing where
-    that is more than `most`."""
+    that is more than `most` (default: MAX_KEPT_BYTES)."""
 
-    def __init__(self, total: int, most: int = MAX_KEPT_BYTES) -> None:
-        self._pictures: dict[tuple[str, str, int], Any] | None = {} if total <= most else None
+    def __init__(self, total: int, most: int | None = None) -> None:
+        fits = total <= (MAX_KEPT_BYTES if most is None else most)
+        self._pictures: dict[tuple[str, str, int], Any] | None = {} if fits else None
 
     def get(self, kind: str, camera: str, t: int, read: Callable[[str, int], Pixels]) -> Pixels:
         """What `read` gave for `camera` at timestep `t` the first time; the caller may change the array."""
