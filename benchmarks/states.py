@@ -26,7 +26,7 @@ from splashbench.scene import Scene
 from splashbench.score import PROTOCOL_V1
 from splashbench.score.image.fidelity import psnr
 from splashbench.score.image.silhouette import iou
-from splashbench.score.protocol import require_same_scene
+from splashbench.score.protocol import require_complete
 from splashbench.submission import Submission
 
 
@@ -43,6 +43,10 @@ def figures(scene: Scene, views: Any, every: int, what: str) -> tuple[float, flo
                     each.astype(np.float64) / 255 for each in (views.rendering(name, t), scene.image(name, t))
                 )
                 fidelity[name].append(psnr(shown, true, mask, PROTOCOL_V1.psnr_cap_db))
+    if not any(fidelity.values()):
+        raise SplashbenchError(
+            f"{scene.directory}: each {every}. frame of its test views has too little liquid for PSNR"
+        )
     means = [[fmean(values) for values in each.values() if values] for each in (fidelity, overlap)]
     return fmean(means[0]), fmean(means[1])
 
@@ -50,7 +54,7 @@ def figures(scene: Scene, views: Any, every: int, what: str) -> tuple[float, flo
 def rows(scene: Scene, path: Path, every: int) -> Iterator[tuple[str, str, str, str]]:
     """Of the run in `path`: its method, seconds of the fit, PSNR and mIoU of each state."""
     submission = Submission.open(path)
-    require_same_scene(scene, submission)
+    require_complete(scene, submission)
     states = [(checkpoint.seconds, views) for checkpoint, views in submission.checkpoints()]
     for seconds, views in [*states, (submission.record.fit_seconds, submission)]:
         fidelity, overlap = figures(scene, views, every, f"{path.name} after {seconds:.0f} s")

@@ -290,6 +290,14 @@ def told_nothing() -> Figure:
     return figure
 
 
+def logarithmic(place: Axes, ticks: Sequence[float], label: str, title: str) -> None:
+    place.set_xscale("log")
+    place.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
+    place.set_xticks([], minor=True)
+    place.set_xlabel(label)
+    place.set_title(title)
+
+
 def quality_over_time(name: str = "quality_over_time") -> Figure:
     rows = [row for row in read(HERE / "data" / f"{name}.csv") if row["seconds"]]
     figure = Figure(figsize=(9.2, 2.8), layout="constrained")
@@ -306,13 +314,9 @@ def quality_over_time(name: str = "quality_over_time") -> Figure:
             ]
             place.step(*zip(*points), where="post", color=color, lw=1.4)
             place.plot(*zip(*points), marker, mec=color, mfc="white", ms=4, label=name)
-        place.set_xscale("log")
         last = max(float(row["seconds"]) for row in rows)
         ticks = (5, 10, 20, 40, 80, 160, 300) if last <= 300 else (10, 20, 40, 80, 160, 320, 640)
-        place.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
-        place.set_xticks([], minor=True)
-        place.set_xlabel("seconds of the fit")
-        place.set_title(title)
+        logarithmic(place, ticks, "seconds of the fit", title)
     legend(places[-1])
     return figure
 
@@ -331,12 +335,7 @@ def capacity() -> Figure:
             (float(row["limit"]), float(row["psnr"])) for row in rows if (row["budget"], row["scene"]) == (unit, scene)
         ]
         place.plot(*zip(*sorted(points)), "o-", color=BLUE, mfc="white", ms=4, lw=1.4)
-        place.set_xscale("log")
-        ticks = [limit for limit, _ in sorted(points)]
-        place.set_xticks(ticks, [f"{limit:g}" for limit in ticks], minor=False)
-        place.set_xticks([], minor=True)
-        place.set_xlabel(title)
-        place.set_title(f"PSNR, dB ({scene})")
+        logarithmic(place, [limit for limit, _ in sorted(points)], title, f"PSNR, dB ({scene})")
     return figure
 
 
@@ -367,12 +366,7 @@ def whole_fit_told_nothing() -> Figure:
             points = [(float(row["seconds"]), float(row[metric])) for row in rows if row["method"] == name]
             place.step(*zip(*points), where="post", color=color, lw=1.4, ls=line)
             place.plot(*zip(*points), marker, color=color, mfc="white", ms=4, label=name)
-        place.set_xscale("log")
-        ticks = (30, 60, 120, 300, 600, 1800)
-        place.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
-        place.set_xticks([], minor=True)
-        place.set_xlabel("seconds of the fit at 1200x1800")
-        place.set_title(title)
+        logarithmic(place, (30, 60, 120, 300, 600, 1800), "seconds of the fit at 1200x1800", title)
     legend(places[-1])
     return figure
 
