@@ -100,7 +100,7 @@ sanitize: .venv/installed-test
 	LD_PRELOAD="$$(for name in asan ubsan stdc++; do $(SANITIZE_CXX) -print-file-name=lib$$name.so; done | tr '\n' ' ')" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	SPLASHBENCH_KERNEL="$(CURDIR)/build/sanitized" SPLASHBENCH_SIMD=$(SANITIZE_VARIANT) \
-	$(BIN)/python -m pytest -q -m "not slow and not cuda" tests/native tests/render tests/observe/test_carving.py tests/methods/test_scaffold_kernel.py tests/methods/splashsplat/test_kernel_*.py
+	$(BIN)/python -m pytest -q -m "not slow and not cuda" tests/native tests/render tests/observe/test_carving.py tests/gaussians/test_ssim.py tests/methods/test_scaffold_kernel.py tests/methods/splashsplat/test_kernel_*.py
 
 clean:
 	rm -rf .venv build dist site demo_output example_output *.egg-info .pytest_cache .mypy_cache .ruff_cache splashbench/*/kernel/lib*.so methods/*/kernel/lib*.so

@@ -78,6 +78,9 @@ COMPILE_FLAGS = (
     "-Wno-unknown-warning-option",  # clang has no such warning
     "-Isplashbench",  # from the root of the source tree: #include "native/simd.h"
 )
+# Compiled so that every product and sum is rounded for itself, so that all variants give the same bits.
+EXACT_SOURCES = ("splashbench/gaussians/kernel/ssim.cpp",)
+EXACT_FLAGS = ("-ffp-contract=off", "-fno-reciprocal-math")  # after COMPILE_FLAGS, to replace two of these
 LINK_FLAGS = ("-shared", "-pthread", "-s")  # -s: names of static functions are two thirds of the file
 # The C++ library inside, so that no other one is needed or met at run time. zig always does that.
 STATIC_FLAGS = ("-static-libstdc++", "-static-libgcc", "-Wl,--exclude-libs,ALL")
@@ -100,9 +103,12 @@ class Compiler:
     is_zig: bool = False
     static: bool = True  # it has the C++ library in static form
 
-    def compile_flags(self, variant: KernelVariant, sanitize: bool = False) -> tuple[str, ...]:
+    def compile_flags(
+        self, variant: KernelVariant, sanitize: bool = False, source: Path | None = None
+    ) -> tuple[str, ...]:
         processor = (*ZIG_TARGET, *variant.zig_cpu) if self.is_zig else variant.instructions
-        return (*processor, *COMPILE_FLAGS, *(SANITIZE_FLAGS if sanitize else ()), *variant.defines)
+        exact = EXACT_FLAGS if source is not None and source.as_posix() in EXACT_SOURCES else ()
+        return (*processor, *COMPILE_FLAGS, *exact, *(SANITIZE_FLAGS if sanitize else ()), *variant.defines)
 
     def link_flags(self, sanitize: bool = False) -> tuple[str, ...]:
         # No processor here: zig compiles its C++ library when it links, once for all variants if they link alike.

@@ -138,7 +138,7 @@ class _Workshop:
             self._environment.setdefault(name, str(folder / "zig"))
 
     def compile(self, source: Path, variant: KernelVariant) -> Path:
-        flags = self._compiler.compile_flags(variant, self._sanitize)
+        flags = self._compiler.compile_flags(variant, self._sanitize, source)
         inputs = (*headers_for(source.parent, self._root), source)
         contents = [(self._root / path).read_bytes() for path in inputs]
         digest = _digest(self._identity, *flags, str(source), *contents)

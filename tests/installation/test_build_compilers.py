@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from build_compilers import (
+    EXACT_SOURCES,
     VARIANTS,
     ZIG,
     ZIGLANG,
@@ -135,6 +136,16 @@ def test_flags_keep_the_rounding_that_the_code_states(compiler: Compiler, varian
     flags = compiler.compile_flags(variant)
     assert {"-O3", "-std=c++17", "-fPIC", f"-DSPLASH_LANES={variant.lanes}"} <= set(flags)
     assert not {"-ffast-math", "-Ofast", "-ffinite-math-only", "-fassociative-math"} & set(flags)
+
+
+@pytest.mark.parametrize("compiler", [GCC, ZIG])
+def test_sources_that_give_the_same_bits_everywhere_have_no_multiply_adds(compiler: Compiler) -> None:
+    (exact,) = map(Path, EXACT_SOURCES)
+    assert (ROOT / exact).is_file()
+    for flags in (compiler.compile_flags(VARIANTS[0], False, exact), compiler.compile_flags(VARIANTS[2], True, exact)):
+        assert flags.index("-ffp-contract=off") > flags.index("-ffp-contract=fast")
+        assert flags.index("-fno-reciprocal-math") > flags.index("-freciprocal-math")
+    assert "-ffp-contract=off" not in compiler.compile_flags(VARIANTS[0], False, exact.with_name("api.cpp"))
 
 
 @pytest.mark.parametrize("compiler", [GCC, ZIG])

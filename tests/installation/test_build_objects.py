@@ -68,7 +68,8 @@ def test_a_folder_of_sources_in_a_room_or_a_method_is_a_kernel(tree: Path) -> No
 
 
 def test_the_kernels_of_this_checkout() -> None:
-    assert [kernel.name for kernel in build_kernel.kernels()] == ["scaffold_gs", "splashsplat", "observe", "render"]
+    names = [kernel.name for kernel in build_kernel.kernels()]
+    assert names == ["scaffold_gs", "splashsplat", "gaussians", "observe", "render"]
     assert build_kernel.headers_for(build_kernel.NATIVE)
 
 

@@ -105,6 +105,7 @@ def test_a_source_archive_needs_no_compiler(checkout: Path, tmp_path: Path) -> N
 IN_TREE = {
     f"{folder}/kernel/lib{name}_{variant}.so"
     for folder, name in (
+        ("splashbench/gaussians", "gaussians"),
         ("splashbench/observe", "observe"),
         ("splashbench/render", "render"),
         ("methods/scaffold_gs", "scaffold_gs"),

@@ -167,14 +167,14 @@ def image_loss(
 
     area: pixels over which the silhouette term averages.
     """
-    foreground, gradient, silhouette = losses.image_terms(image, alpha, photograph)
-    loss = weights.foreground * foreground + weights.gradient * gradient + weights.silhouette * silhouette / area
-    if ssim_weight > 0 or weights.beside > 0:
+    terms = losses.image_terms(image, alpha, photograph, ssim_weight > 0)
+    loss = weights.foreground * terms.foreground + weights.gradient * terms.gradient
+    loss = loss + weights.silhouette * terms.silhouette / area
+    if terms.ssim is not None:
+        loss = loss + ssim_weight * (1 - terms.ssim)
+    if weights.beside > 0:
         truth = photograph.image.to(torch.float32) / 255
-        if ssim_weight > 0:
-            loss = loss + ssim_weight * losses.ssim_loss(image[photograph.box], truth)
-        if weights.beside > 0:
-            loss = loss + weights.beside * losses.beside_loss(image[photograph.box], truth, photograph.mask)
+        loss = loss + weights.beside * losses.beside_loss(image[photograph.box], truth, photograph.mask)
     return loss
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splashbench.gaussians.ssim import SsimTarget, ssim, ssim_by_torch
+from splashbench.gaussians.ssim import ssim_by_torch
 
-from ..kernel.window_loss import WindowPhotograph, window_losses
+from ..kernel.window_loss import WindowLosses, WindowPhotograph, window_losses
 
 EPSILON = 1e-6
 SEPARATION_MARGIN = 0.6
@@ -57,35 +57,31 @@ def gradient_loss(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     return total / (3 * pairs + EPSILON)
 
 
-def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
-    """1 - SSIM of two [h, w, 3] images, differentiable by the first."""
-    if image.device.type != "cpu":
-        return 1 - ssim_by_torch(image, target.permute(2, 0, 1))
-    return 1 - ssim(image, SsimTarget(target))
-
-
 def silhouette_loss(alpha: Tensor, mask: Tensor, area: float) -> Tensor:
     """L1 between rendered foreground opacity and mask over `area` pixels (the paper: of the image)."""
     return (alpha - mask).abs().sum() / area
 
 
-def image_terms(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:
-    """(foreground, gradient, silhouette) of a window, the last one summed over its pixels: on the CPU by the kernel,
-    which works in one pass, and elsewhere by `image_terms_by_torch`."""
+def image_terms(image: Tensor, alpha: Tensor, photograph: WindowPhotograph, with_ssim: bool = False) -> WindowLosses:
+    """The losses of a window, the silhouette's summed over its pixels: on the CPU by the kernel, which works in one
+    pass, and elsewhere by `image_terms_by_torch`."""
     by = window_losses if image.device.type == "cpu" else image_terms_by_torch
-    return by(image, alpha, photograph)
+    return by(image, alpha, photograph, with_ssim)
 
 
-def image_terms_by_torch(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:
+def image_terms_by_torch(
+    image: Tensor, alpha: Tensor, photograph: WindowPhotograph, with_ssim: bool = False
+) -> WindowLosses:
     """`image_terms` by torch's operations, on the device where all lie."""
     inside, truth = image[photograph.box], photograph.image.to(torch.float32) / 255
     mask = photograph.mask.to(torch.float32)
     whole = torch.zeros_like(alpha)
     whole[photograph.box] = mask
-    return (
+    return WindowLosses(
         foreground_loss(inside, truth, mask),
         gradient_loss(inside, truth, mask),
         silhouette_loss(alpha, whole, area=1.0),
+        ssim_by_torch(inside, truth.permute(2, 0, 1)) if with_ssim else None,
     )
 
 

@@ -6,18 +6,19 @@ With the error e = image - truth, all within the box that the photograph covers:
     gradient = sum over pairs of neighbours with at least one in the mask of |e' - e| / (3 such pairs)
     silhouette = sum over the whole window of |alpha - mask|
 
-Results and gradients do not depend on the number of threads.
+and SSIM of the box where it is asked for. Results and gradients do not depend on the number of threads.
 """
 
 from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from splashbench.gaussians.ssim import similarity
 from splashbench.native import memory
 from splashbench.native.library import DONE
 from splashbench.native.threads import kernel_threads
@@ -50,8 +51,17 @@ class WindowPhotograph:
         return WindowPhotograph(self.image.to(device), self.mask.to(device), self.top, self.left)
 
 
-def window_losses(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> tuple[Tensor, Tensor, Tensor]:
-    """(foreground, gradient, silhouette), scalars; differentiable by `image`, float32 [h, w, 3], and `alpha` [h, w].
+class WindowLosses(NamedTuple):
+    """What is asked of a window, scalars; see above. ssim: None where it was not."""
+
+    foreground: Tensor
+    gradient: Tensor
+    silhouette: Tensor
+    ssim: Tensor | None = None
+
+
+def window_losses(image: Tensor, alpha: Tensor, photograph: WindowPhotograph, with_ssim: bool = False) -> WindowLosses:
+    """Differentiable by `image`, float32 [h, w, 3], and `alpha` [h, w].
 
     Raises TypeError or ValueError where these do not fit together.
     """
@@ -68,8 +78,8 @@ def window_losses(image: Tensor, alpha: Tensor, photograph: WindowPhotograph) ->
         raise ValueError(
             f"a box of {columns}x{rows} px at {photograph.left}, {photograph.top} leaves {width}x{height} px"
         )
-    losses = _WindowLosses.apply(image, alpha, photograph)
-    return losses[0], losses[1], losses[2]
+    losses = _WindowLosses.apply(image, alpha, photograph, with_ssim)
+    return WindowLosses(losses[0], losses[1], losses[2], losses[3] if with_ssim else None)
 
 
 def _run(function: Any, photograph: WindowPhotograph, image: Tensor, alpha: Tensor, *rest: Any) -> None:
@@ -83,20 +93,28 @@ def _run(function: Any, photograph: WindowPhotograph, image: Tensor, alpha: Tens
 
 class _WindowLosses(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, alpha: Tensor, photograph: WindowPhotograph) -> Tensor:
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, photograph: WindowPhotograph, with_ssim: bool) -> Tensor:
         image, alpha = image.contiguous(), alpha.contiguous()
         losses = (ctypes.c_double * 3)()
         _run(KERNEL.library.splash_window_losses, photograph, image, alpha, losses)
-        ctx.photograph = photograph
+        ctx.photograph, ctx.by_ssim = photograph, None
         ctx.save_for_backward(image, alpha)
-        return torch.tensor(list(losses), dtype=torch.float32)
+        found = list(losses)
+        if with_ssim:
+            value, by_ssim = similarity(image.detach().numpy()[photograph.box], photograph.image.numpy())
+            ctx.by_ssim = torch.from_numpy(by_ssim)
+            found.append(value)
+        return torch.tensor(found, dtype=torch.float32)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, Tensor, None, None]:
         image, alpha = ctx.saved_tensors
-        weights = (ctypes.c_double * 3)(*outer.tolist())
+        weights = (ctypes.c_double * 3)(*outer[:3].tolist())
         by_image, by_alpha = (torch.from_numpy(memory.empty(tuple(t.shape))) for t in (image, alpha))
         function = KERNEL.library.splash_window_gradients
         _run(function, ctx.photograph, image, alpha, weights, by_image.data_ptr(), by_alpha.data_ptr())
-        return by_image, by_alpha, None
+        if ctx.by_ssim is not None:
+            scaled = torch.from_numpy(memory.empty(tuple(ctx.by_ssim.shape)))
+            by_image[ctx.photograph.box] += torch.mul(ctx.by_ssim, outer[3], out=scaled)
+        return by_image, by_alpha, None, None

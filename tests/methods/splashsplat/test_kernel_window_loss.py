@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from splashbench.gaussians.ssim import ssim_by_torch
 from splashbench.native.threads import use_threads
 from splashbench_methods.splashsplat.appearance import losses
 from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph, window_losses
@@ -30,12 +31,12 @@ def case(rows: int, columns: int, around: tuple[int, int, int, int] = (0, 0, 0, 
 
 
 def outcome(sample: Case, kernel: bool) -> list[torch.Tensor]:
-    """The three losses, and the gradients of their sum with weights."""
+    """The four losses, and the gradients of their sum with weights."""
     image, alpha, photograph = sample
     kind = torch.float32 if kernel else torch.float64
     image, alpha = (value.to(kind, copy=True).requires_grad_() for value in (image, alpha))
     if kernel:
-        terms = window_losses(image, alpha, photograph)
+        terms = window_losses(image, alpha, photograph, with_ssim=True)
     else:
         truth = photograph.image.double() / 255
         mask = torch.zeros_like(alpha)
@@ -45,8 +46,10 @@ def outcome(sample: Case, kernel: bool) -> list[torch.Tensor]:
             losses.foreground_loss(image[near], truth, mask[near]),
             losses.gradient_loss(image[near], truth, mask[near]),
             losses.silhouette_loss(alpha, mask, 1.0),
+            ssim_by_torch(image[near].float(), truth.permute(2, 0, 1).float()).to(kind),
         )
-    gradients = torch.autograd.grad(0.5 * terms[0] + 0.3 * terms[1] + 0.7 * terms[2], [image, alpha])
+    total = 0.5 * terms[0] + 0.3 * terms[1] + 0.7 * terms[2] - 0.2 * terms[3]
+    gradients = torch.autograd.grad(total, [image, alpha])
     return [term.detach() for term in terms] + list(gradients)
 
 
@@ -76,7 +79,8 @@ def test_the_number_of_threads_does_not_matter():
 def test_an_empty_mask_leaves_the_silhouette_alone():
     image, alpha, photograph = case(20, 20)
     photograph.mask.fill_(False)
-    foreground, gradient, silhouette = window_losses(image, alpha, photograph)
+    foreground, gradient, silhouette, ssim = window_losses(image, alpha, photograph)
+    assert ssim is None
     assert float(foreground) == float(gradient) == 0
     assert float(silhouette) == pytest.approx(float(alpha.sum()), rel=1e-5)
 

@@ -50,7 +50,7 @@ def test_the_losses_of_an_image_by_torch_are_the_kernels() -> None:
     )
     image, alpha = (torch.rand(shape).requires_grad_() for shape in ((31, 44, 3), (31, 44)))
     for theirs, ours in zip(
-        window_losses(image, alpha, photograph), losses.image_terms_by_torch(image, alpha, photograph)
+        window_losses(image, alpha, photograph, True), losses.image_terms_by_torch(image, alpha, photograph, True)
     ):
         assert float(ours.detach()) == pytest.approx(float(theirs.detach()), rel=1e-5)
         expected = torch.autograd.grad(theirs, (image, alpha), retain_graph=True, materialize_grads=True)
