@@ -37,9 +37,9 @@ class ReducedScene:
         return np.count_nonzero(squares, axis=(1, 3)) >= factor
 
 
-def reduction(scene: MaskedScene, cells: int) -> int:
+def reduction(scene: MaskedScene, cells: int, pixels: float = PIXELS_PER_VOXEL) -> int:
     """The whole number by which `scene` is reduced as far as a hull of `cells` voxels along the liquid's longest side
-    allows.
+    allows. pixels: of a voxel that are kept, at least.
 
     The longest side is taken from what the views ever see of the liquid, in the view that sees it smallest.
     """
@@ -53,7 +53,7 @@ def reduction(scene: MaskedScene, cells: int) -> int:
             for window in windows[1:]:
                 union = union.joined(window)
             longest.append(max(union.shape))
-    return max(1, int(min(longest) / cells / PIXELS_PER_VOXEL)) if longest else 1
+    return max(1, int(min(longest) / cells / pixels)) if longest else 1
 
 
 def reduced(scene: MaskedScene, cells: int) -> MaskedScene:

@@ -6,10 +6,14 @@ behind a container's glass.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from splashbench.gaussians.devices import CPU
+from splashbench.native import memory
 from splashbench.render import Frozen, compositing_weights, rasterize
 from splashbench.scene.camera import Camera
 
@@ -77,7 +81,7 @@ def _behind_wall(
     """`composite` where a wall cuts the liquid, except for the carriers `in_front` of it."""
     if in_front is None or not bool(in_front.any()):
         image, alpha = rasterize(*shapes, colors, camera, background=background)
-        return image + wall[..., None] * (background - image), alpha * (1 - wall)
+        return _cut(image, alpha, background, wall)
     # Children of one carrier follow each other.
     drawn_last = in_front.repeat_interleave(len(colors) // len(in_front))
 
@@ -89,10 +93,42 @@ def _behind_wall(
         )
         return drawn
 
-    image, alpha = part(~drawn_last, background)
-    image, alpha = image + wall[..., None] * (background - image), alpha * (1 - wall)
+    image, alpha = _cut(*part(~drawn_last, background), background, wall)
     over, opacity = part(drawn_last, None)
     return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
+
+
+def _cut(image: Tensor, alpha: Tensor, background: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:
+    """`image` [h, w, 3] and its opacity `alpha` [h, w] where a wall stands before the share `wall` [h, w] of each
+    pixel, which the `background` [h, w, 3] or [3] shows."""
+    if image.device.type != CPU:
+        return image + wall[..., None] * (background - image), alpha * (1 - wall)
+    cut: tuple[Tensor, Tensor] = _Cut.apply(image, alpha, background, wall)
+    return cut
+
+
+class _Cut(torch.autograd.Function):
+    """`_cut` on the CPU, in memory that is used again: these images are large, and torch would make six of them."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, background: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(wall)
+        shown = _unset(image)
+        torch.sub(background, image, out=shown).mul_(wall[..., None]).add_(image)
+        return shown, torch.sub(1, wall, out=_unset(alpha)).mul_(alpha)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_shown: Tensor, by_opacity: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        (wall,) = ctx.saved_tensors
+        hidden = torch.mul(by_shown, wall[..., None], out=_unset(by_shown))
+        by_image = torch.sub(by_shown, hidden, out=hidden)
+        return by_image, torch.sub(1, wall, out=_unset(by_opacity)).mul_(by_opacity), None, None
+
+
+def _unset(like: Tensor) -> Tensor:
+    """Contiguous memory of its shape, float32, not initialised."""
+    return torch.from_numpy(memory.empty(tuple(like.shape)))
 
 
 def shares(

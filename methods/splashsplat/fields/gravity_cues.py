@@ -76,6 +76,7 @@ class GravityCues:
 
 def gravity_cues(
     silhouettes: Silhouettes,
+    coarse: Silhouettes,
     bounds: Bounds,
     container: ContainerOcclusion | None,
     gravity: np.ndarray,
@@ -87,8 +88,9 @@ def gravity_cues(
 ) -> GravityCues:
     """Look at all frames on a coarse grid over `bounds`.
 
-    gravity: unit vector [3]. metres_per_unit: None where the scale or the frames' times are not known; then no jet is
-    looked for, as the speed of a fall is not known either. container_depths: see `GravityCues`.
+    coarse: the masks as that grid needs them. gravity: unit vector [3]. metres_per_unit: None where the scale or the
+    frames' times are not known; then no jet is looked for, as the speed of a fall is not known either.
+    container_depths: see `GravityCues`.
     """
     turn = upright(gravity)
     vessel = None if container is None else Vessel.of(container.mesh, gravity)
@@ -104,7 +106,7 @@ def gravity_cues(
         grid = Grid.over(bounds, _CELLS)
         upright_nodes = grid.nodes().reshape(-1, 3) @ turn.T
         frames: list[Slices] = []
-        for phi in signed_distance_frames(silhouettes, grid, "silhouette", container):
+        for phi in signed_distance_frames(coarse, grid, "silhouette", container):
             filled = np.clip(0.5 - phi.reshape(-1), 0, 1)
             inside = filled > 0
             frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))

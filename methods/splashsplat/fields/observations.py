@@ -18,9 +18,11 @@ import torch
 
 from splashbench.background.clean_plate import make_clean_plates
 from splashbench.container.footage_vessel import Standing, standing_about_liquid
+from splashbench.errors import SplashbenchError
 from splashbench.harness.contract import Decision, Run, Rung
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames, trusted_bounds
 from splashbench.observe.grid import Bounds
+from splashbench.observe.hull import REFINED_CELLS
 from splashbench.observe.kernels import resample
 from splashbench.observe.observable import Observable, observable
 from splashbench.observe.occlusion import ContainerOcclusion, focal_length
@@ -38,7 +40,9 @@ from .rim import Rim, rim_of
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 12
+_REVISION = 13
+# Pixels that a voxel of a coarse grid spans, at least, where smaller masks stand for large ones.
+_COARSE_PIXELS = 3.0
 
 
 @dataclass(frozen=True)
@@ -174,11 +178,13 @@ def _standing(scene: TrainingScene) -> Standing:
 
 @dataclass(frozen=True)
 class Sighting:
-    """What the masks of `scene` say whatever the grids. silhouettes, container: see `Observations`. rim: of the
-    container, where it was looked for. bounds: the padded box around all liquid."""
+    """What the masks of `scene` say whatever the grids. silhouettes, container: see `Observations`. coarse: the masks
+    as coarse grids need them, smaller where they are large. rim: of the container, where it was looked for. bounds:
+    the padded box around all liquid."""
 
     scene: TrainingScene
     silhouettes: Silhouettes
+    coarse: Silhouettes
     container: ContainerOcclusion | None
     rim: Rim | None
     bounds: Bounds
@@ -245,6 +251,7 @@ def observe(
         with run.stage("jet and pool"):
             cues = gravity_cues(
                 silhouettes,
+                sighting.coarse,
                 bounds,
                 container,
                 gravity,
@@ -281,20 +288,39 @@ def _sighting(
     if key in before:
         return before[key]
     with run.stage("signed distance"):
-        silhouettes = Silhouettes(
-            ReducedScene(scene, factor) if factor > 1 else scene,
-            interpolate_times=None if settings.camera_times else False,
-            replace_empty=settings.replace_empty_masks,
-        )
+        silhouettes = _silhouettes(scene, factor, settings)
+        coarse = _coarse(scene, factor, silhouettes, settings)
     container, rim = known.occlusion, None
     if container is not None and container.hides and settings.cut_at_rim:
         report(0.0, "looking where the container's rim ends the liquid")
         with run.stage("rim"):
             rim = rim_of(known, scene, silhouettes.failed_masks)
         container = container.with_mesh(rim.mesh)
-    bounds = _bounds(scene, silhouettes, container, settings, run, report)
-    found = before[key] = Sighting(scene, silhouettes, container, rim, bounds)
+    bounds = _bounds(scene, silhouettes, coarse, container, settings, run, report)
+    found = before[key] = Sighting(scene, silhouettes, coarse, container, rim, bounds)
     return found
+
+
+def _silhouettes(scene: TrainingScene, factor: int, settings: FieldSettings) -> Silhouettes:
+    """The masks of `scene`, reduced by `factor`."""
+    return Silhouettes(
+        ReducedScene(scene, factor) if factor > 1 else scene,
+        interpolate_times=None if settings.camera_times else False,
+        replace_empty=settings.replace_empty_masks,
+    )
+
+
+def _coarse(scene: TrainingScene, factor: int, silhouettes: Silhouettes, settings: FieldSettings) -> Silhouettes:
+    """`silhouettes`, of `scene` reduced by `factor`, as coarse grids need them: distances in masks of millions of
+    pixels took most of the look for failed masks. The same where they are small, or where liquid would be lost."""
+    smaller = reduction(scene, REFINED_CELLS, _COARSE_PIXELS)
+    if settings.signed_distance != "silhouette" or smaller <= factor:
+        return silhouettes
+    try:
+        coarse = _silhouettes(scene, smaller, settings)
+    except SplashbenchError:  # hardly any liquid is left
+        return silhouettes
+    return coarse if np.array_equal(coarse.sees_liquid, silhouettes.sees_liquid) else silhouettes
 
 
 def _grid_decision(found: Observable, share: float, wanted: float, metres: float | None) -> Decision:
@@ -349,22 +375,24 @@ def _cells(bounds: Bounds, pixel: float | None, settings: FieldSettings, voxel_p
 def _bounds(
     scene: TrainingScene,
     silhouettes: Silhouettes,
+    coarse: Silhouettes,
     container: ContainerOcclusion | None,
     settings: FieldSettings,
     run: Run,
     report: Report,
 ) -> Bounds:
-    """The padded box around all liquid. Failed masks are looked for first, and distrusted from then on."""
+    """The padded box around all liquid. Failed masks are looked for first, and distrusted from then on. coarse: see
+    `Sighting`."""
 
     def find() -> tuple[np.ndarray, Bounds]:
         if settings.detect_failed_masks:
             report(0.0, "looking for failed masks")
             with run.stage("failed masks"):
-                bounds = trusted_bounds(silhouettes, container)
+                bounds = trusted_bounds(coarse, container)
         else:
             with run.stage("signed distance"):
-                bounds = sequence_bounds(silhouettes, container, settings.tight_bounds)
-        return silhouettes.failed_masks, bounds.padded(PADDING)
+                bounds = sequence_bounds(coarse, container, settings.tight_bounds)
+        return coarse.failed_masks, bounds.padded(PADDING)
 
     def save(result: tuple[np.ndarray, Bounds], directory: Path) -> None:
         failed, bounds = result
@@ -375,5 +403,6 @@ def _bounds(
             return stored["failed"], Bounds(stored["low"], stored["high"])
 
     failed, bounds = run.reuse("bounds", scene, settings.key(), find, save, load, seeded=False)
-    silhouettes.distrust(failed)
+    for masks in (silhouettes, coarse):
+        masks.distrust(failed)
     return bounds

@@ -358,7 +358,7 @@ def test_carriers_land_on_the_pool_and_on_the_walls(poured):
     container = ContainerOcclusion(poured.mesh, DOWN)
     bounds = sequence_bounds(silhouettes, container).padded(0.1)
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    known = gravity_cues(silhouettes, bounds, container, DOWN, None, np.arange(2.0), depths)
+    known = gravity_cues(silhouettes, silhouettes, bounds, container, DOWN, None, np.arange(2.0), depths)
     assert known.jets == [None, None]
     grid = Grid.over(Bounds(np.full(3, -0.2), np.full(3, 0.2)), 80)
     start = grid.to_voxels(np.array([[0, 0.15, 0], [0, 0.03, 0], [0, 0.15, 0], [0, 0.15, 0]]))

@@ -10,6 +10,8 @@ import pytest
 
 from splashbench.harness.contract import Run
 from splashbench.observe import Bounds, Silhouettes, sequence_bounds
+from splashbench.observe.occlusion import ContainerOcclusion
+from splashbench.observe.reduced_masks import ReducedScene
 from splashbench.scene import Scene
 from splashbench_methods.splashsplat.fields import observations
 from splashbench_methods.splashsplat.fields.observations import Observations, Report, observe
@@ -155,3 +157,45 @@ def test_grids_are_no_finer_than_the_photographs(balls: Scene) -> None:
     # There are some cells however small the photographs, and no more than asked for.
     assert grids(voxel_pixels=16)[:2] == (128, 64)
     assert grids(voxel_pixels=16, hull_cells=64, transport_cells=32)[:2] == (64, 32)
+
+
+def _looked_at(balls: Scene, monkeypatch: pytest.MonkeyPatch, cells: int) -> tuple[Observations, Silhouettes]:
+    """What is observed where coarse grids have `cells`, and the masks in which failed ones are looked for."""
+    looked: list[Silhouettes] = []
+    real = observations.trusted_bounds
+
+    def look(masks: Silhouettes, container: ContainerOcclusion | None) -> Bounds:
+        looked.append(masks)
+        masks.distrust(np.arange(balls.n_frames)[:, None] == [[2, 5, 99, 99, 99]])
+        return real(masks, container)
+
+    monkeypatch.setattr(observations, "trusted_bounds", look)
+    monkeypatch.setattr(observations, "REFINED_CELLS", cells)
+    observed, _ = _observed(balls, Run())
+    return observed, looked[0]
+
+
+def test_coarse_grids_take_smaller_masks_of_large_photographs(balls: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, masks = _looked_at(balls, monkeypatch, 96)
+    assert masks is whole.silhouettes
+    observed, masks = _looked_at(balls, monkeypatch, 4)
+    wide = balls.cameras[balls.train[0]].width
+    assert masks.cameras[0].width < 0.7 * wide
+    assert observed.silhouettes.cameras[0].width == wide
+    # What failed in either does in both.
+    np.testing.assert_array_equal(observed.silhouettes.failed_masks, masks.failed_masks)
+    assert masks.failed_masks[[2, 5], [0, 1]].all()
+    # A coarse pixel is two fine ones wide.
+    assert observed.pixel is not None
+    np.testing.assert_allclose(observed.hull_grid.origin, whole.hull_grid.origin, atol=4 * observed.pixel)
+    np.testing.assert_allclose(observed.hull_grid.voxel, whole.hull_grid.voxel, rtol=0.05)
+
+
+def test_masks_that_would_lose_liquid_stay_as_they_are(balls: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Lossy(ReducedScene):
+        def mask(self, camera: str, t: int) -> np.ndarray:
+            return super().mask(camera, t) & (t != 3)
+
+    monkeypatch.setattr(observations, "ReducedScene", Lossy)
+    observed, masks = _looked_at(balls, monkeypatch, 4)
+    assert masks is observed.silhouettes
