@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "29"
+VERSION = "30"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -229,7 +229,7 @@ class SplashSplatConfig(MethodConfig):
     #: carriers begin with the colours in which the photographs show them, or else at random as in the paper
     first_look: bool = True
     #: share of the iterations, the first ones, that see photographs at half their size; 0 for none
-    coarse_share: float = Field(0.9, ge=0, le=1)
+    coarse_share: float = Field(0.95, ge=0, le=1)
     #: share of the iterations, the first ones of these, that see them at a quarter
     coarsest_share: float = Field(0.4, ge=0, le=1)
     #: pixels along the longest side beyond which photographs are large enough for that
