@@ -8,10 +8,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from splashbench.observe.silhouettes import ImageWindow, MaskedScene
+from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
 
 #: pixels per voxel that are kept, at least
 PIXELS_PER_VOXEL = 2.0
+
+
+class HeldMasks:
+    """The masks that `silhouettes` of `scene` hold, as a scene: to read large ones anew takes seconds."""
+
+    def __init__(self, scene: MaskedScene, silhouettes: Silhouettes) -> None:
+        self._silhouettes = silhouettes
+        self.name, self.train, self.n_frames = scene.name, silhouettes.views, silhouettes.n_frames
+        self.cameras = dict(zip(silhouettes.views, silhouettes.cameras))
+        # What `Silhouettes` looks for in scenes whose cameras have times of their own.
+        self.times = getattr(scene, "times", None)
+        self.camera_times = getattr(scene, "camera_times", {})
+
+    def mask(self, camera: str, t: int) -> np.ndarray:
+        """Liquid mask of `camera` in frame `t`: bool [h, w]."""
+        view = self.train.index(camera)
+        mask = np.zeros((self.cameras[camera].height, self.cameras[camera].width), dtype=bool)
+        mask[self._silhouettes.windows[view].slices] = self._silhouettes.mask(view, t)
+        return mask
 
 
 class ReducedScene:

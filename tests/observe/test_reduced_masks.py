@@ -7,7 +7,7 @@ import pytest
 
 from splashbench.observe import Bounds, Grid, Silhouettes
 from splashbench.observe.hull import carve_frame
-from splashbench.observe.reduced_masks import ReducedScene, reduced
+from splashbench.observe.reduced_masks import HeldMasks, ReducedScene, reduced, reduction
 from splashbench.parallel import each
 from splashbench.scene.camera import Camera
 
@@ -70,6 +70,16 @@ def test_the_hull_is_the_same_to_a_fraction_of_a_voxel(factor: int):
     assert np.abs(full - small)[near].max() < 1.5 / pixels_per_voxel
     # A line across a square fills it: the outline moves out, by less than half a reduced pixel.
     assert 0 <= (full - small)[near].mean() < 0.5 / pixels_per_voxel
+
+
+def test_masks_that_silhouettes_hold_are_those_of_the_scene():
+    scene = BallScene()
+    held = HeldMasks(scene, Silhouettes(scene, views=["2", "0"]))
+    assert held.train == ("2", "0")
+    for name in held.train:
+        np.testing.assert_array_equal(held.mask(name, 0), scene.mask(name, 0))
+        np.testing.assert_array_equal(ReducedScene(held, 3).mask(name, 0), ReducedScene(scene, 3).mask(name, 0))
+    assert reduction(held, 30, 3.0) == reduction(scene, 30, 3.0) == 2
 
 
 def test_masks_are_reduced_only_as_far_as_the_hull_allows():

@@ -26,7 +26,7 @@ from splashbench.observe.hull import REFINED_CELLS
 from splashbench.observe.kernels import resample
 from splashbench.observe.observable import Observable, observable
 from splashbench.observe.occlusion import ContainerOcclusion, focal_length
-from splashbench.observe.reduced_masks import ReducedScene, reduction
+from splashbench.observe.reduced_masks import HeldMasks, ReducedScene, reduction
 from splashbench.observe.signed_distance import PADDING, SignedDistanceMethod
 from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.scene import TrainingScene
@@ -289,7 +289,7 @@ def _sighting(
         return before[key]
     with run.stage("signed distance"):
         silhouettes = _silhouettes(scene, factor, settings)
-        coarse = _coarse(scene, factor, silhouettes, settings)
+        coarse = _coarse(scene, silhouettes, settings)
     container, rim = known.occlusion, None
     if container is not None and container.hides and settings.cut_at_rim:
         report(0.0, "looking where the container's rim ends the liquid")
@@ -301,7 +301,7 @@ def _sighting(
     return found
 
 
-def _silhouettes(scene: TrainingScene, factor: int, settings: FieldSettings) -> Silhouettes:
+def _silhouettes(scene: TrainingScene | HeldMasks, factor: int, settings: FieldSettings) -> Silhouettes:
     """The masks of `scene`, reduced by `factor`."""
     return Silhouettes(
         ReducedScene(scene, factor) if factor > 1 else scene,
@@ -310,14 +310,15 @@ def _silhouettes(scene: TrainingScene, factor: int, settings: FieldSettings) -> 
     )
 
 
-def _coarse(scene: TrainingScene, factor: int, silhouettes: Silhouettes, settings: FieldSettings) -> Silhouettes:
-    """`silhouettes`, of `scene` reduced by `factor`, as coarse grids need them: distances in masks of millions of
-    pixels took most of the look for failed masks. The same where they are small, or where liquid would be lost."""
-    smaller = reduction(scene, REFINED_CELLS, _COARSE_PIXELS)
-    if settings.signed_distance != "silhouette" or smaller <= factor:
+def _coarse(scene: TrainingScene, silhouettes: Silhouettes, settings: FieldSettings) -> Silhouettes:
+    """`silhouettes` of `scene` as coarse grids need them: distances in masks of millions of pixels took most of the
+    look for failed masks. The same where they are small, or where liquid would be lost."""
+    held = HeldMasks(scene, silhouettes)
+    factor = reduction(held, REFINED_CELLS, _COARSE_PIXELS) if settings.signed_distance == "silhouette" else 1
+    if factor == 1:
         return silhouettes
     try:
-        coarse = _silhouettes(scene, smaller, settings)
+        coarse = _silhouettes(held, factor, settings)
     except SplashbenchError:  # hardly any liquid is left
         return silhouettes
     return coarse if np.array_equal(coarse.sees_liquid, silhouettes.sees_liquid) else silhouettes
