@@ -205,6 +205,18 @@ def test_states_of_a_large_fit_are_what_was_measured() -> None:
             assert told == ([float(shown[-1]["psnr"]), float(shown[-1]["miou"])] if shown else [])
 
 
+def test_states_of_version_30_are_what_was_measured() -> None:
+    with (RESULTS / "data" / "whole_fit_version_30.csv").open(encoding="utf-8", newline="") as file:
+        measured = {
+            round(float(row["seconds"])): (float(row["psnr"]), float(row["miou"])) for row in csv.DictReader(file)
+        }
+    page = " ".join((RESULTS / "whole_fit.md").read_text(encoding="utf-8").split())
+    told = re.findall(r"(\d+\.\d+) (?:dB )?and (\.\d+) (?:at its end )?after (\d+)", page)
+    assert [int(seconds) for *_, seconds in told] == [45, 277, 434, 609]
+    for fidelity, overlap, seconds in told:
+        assert (float(fidelity), float(overlap)) == measured[int(seconds)]
+
+
 def test_told_all_is_what_was_measured() -> None:
     measured, table = told_nothing(), tables("told_nothing.md")[4]
     scenes = table[0][1:-1]
