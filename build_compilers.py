@@ -78,7 +78,7 @@ COMPILE_FLAGS = (
     "-Wno-unknown-warning-option",  # clang has no such warning
     "-Isplashbench",  # from the root of the source tree: #include "native/simd.h"
 )
-# Compiled so that every product and sum is rounded for itself, so that all variants give the same bits.
+# Every product and every sum of these is rounded for itself: all variants give the same bits.
 EXACT_SOURCES = ("splashbench/gaussians/kernel/ssim.cpp",)
 EXACT_FLAGS = ("-ffp-contract=off", "-fno-reciprocal-math")  # after COMPILE_FLAGS, to replace two of these
 LINK_FLAGS = ("-shared", "-pthread", "-s")  # -s: names of static functions are two thirds of the file

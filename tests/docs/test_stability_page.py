@@ -105,7 +105,8 @@ def test_what_is_kept_on_glass_at_the_worst_severity() -> None:
             {StressRun("splashsplat", TANK, 0, r.kind, 5, r.value): r.retention for r in runs.itertuples()}
         )
     said = re.search(
-        r"severity 5 S is (\.\d+) \((\.\d+) to (\.\d+)\) and CVaR10 (\.\d+) \((\.\d+) to (\.\d+)\)", " ".join(PAGE.split())
+        r"severity 5 S is (\.\d+) \((\.\d+) to (\.\d+)\) and CVaR10 (\.\d+) \((\.\d+) to (\.\d+)\)",
+        " ".join(PAGE.split()),
     )
     assert said is not None
     figures = [

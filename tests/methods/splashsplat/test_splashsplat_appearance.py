@@ -12,7 +12,7 @@ from splashbench.render import freeze, rasterize_arrays
 from splashbench.scene import Camera
 from splashbench_methods.splashsplat.appearance import losses
 from splashbench_methods.splashsplat.appearance.averages import ShownHeads
-from splashbench_methods.splashsplat.appearance.compositing import composite
+from splashbench_methods.splashsplat.appearance.compositing import _cut, composite
 from splashbench_methods.splashsplat.appearance.decoder import Children, Decoder, DecoderSettings
 from splashbench_methods.splashsplat.appearance.optimizer import RowAdam
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState
@@ -210,3 +210,18 @@ def test_shown_heads_are_means_over_the_last_steps_and_a_decoder_of_their_own() 
         shown.decoder().opacity.weight.zero_()
     assert float(weight[0, 0].detach()) == values[-1]
     assert float(shown.decoder().opacity.weight[0, 0].detach()) == found
+
+
+# The second is large enough for memory that is used again.
+@pytest.mark.parametrize("size", [(5, 7), (300, 310)])
+@pytest.mark.parametrize("one_color", [False, True])
+def test_what_a_wall_cuts_and_its_gradients_are_the_formulas_bits(size: tuple[int, int], one_color: bool) -> None:
+    torch.manual_seed(0)
+    image, alpha = (torch.rand(shape).requires_grad_() for shape in ((*size, 3), size))
+    background, wall = torch.rand(3) if one_color else torch.rand(*size, 3), torch.rand(size).round(decimals=1)
+    outer = [torch.randn(*size, 3), torch.randn(size)]
+    expected = image + wall[..., None] * (background - image), alpha * (1 - wall)
+    found = _cut(image, alpha, background, wall)
+    gradients = (torch.autograd.grad(pair, (image, alpha), outer) for pair in (found, expected))
+    for one, other in zip((*found, *next(gradients)), (*expected, *next(gradients)), strict=True):
+        assert torch.equal(one, other)
