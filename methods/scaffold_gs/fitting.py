@@ -30,8 +30,8 @@ _SSIM_WEIGHT = 0.2
 _VOLUME_WEIGHT = 0.01
 # Of the iterations left, each coarser level of the pyramid takes this share.
 _COARSE_SHARE = 0.5
-# The structural term's targets are kept between steps up to this size, five times a plate's as float32.
-_TARGET_BYTES = 256 << 20
+# The structural term's targets, a plate's as float32 each, are kept between steps up to this size.
+_TARGET_BYTES = 85 << 20
 # An anchor stays if it makes up at least this much of the seen pixels of all training views together.
 _MIN_PIXELS = 0.5
 
@@ -43,7 +43,7 @@ class _Views:
         self.plates = [shrunk(plate, longest_side) for plate in plates]
         self._rng, self._order = rng, list[int]()
         self._kept: dict[int, SsimTarget] = {}
-        self._keep = sum(plate.image.size for plate in self.plates) * 4 * 3 <= _TARGET_BYTES
+        self._keep = sum(plate.image.size for plate in self.plates) * 4 <= _TARGET_BYTES
 
     def next(self) -> int:
         if not self._order:

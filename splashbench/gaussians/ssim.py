@@ -67,7 +67,7 @@ def similarity(
     """SSIM of `image` [h, w, channels] in [0, 1] to `truth` of the same shape, and its gradient by the image, float32
     of that shape. The same bits on any processor and any number of threads.
 
-    image: its rows may lie apart, as those of a part of another image. truth: contiguous, in [0, 1] or 255ths. weight:
+    image: its rows may lie apart, as those of a part of another image. truth: in [0, 1], or uint8 in 255ths. weight:
     [h, w], what the image is multiplied by before, and its gradient afterwards; `truth` has it already.
 
     Raises ValueError where they are not of one size, and TypeError for other types.
