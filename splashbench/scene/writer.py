@@ -53,9 +53,7 @@ def write_scene(
         outline = size if mask is None else mask.shape
         if image.shape != (*size, 3) or outline != size:
             raise ValueError(f"camera {name}, frame {t}: image {image.shape} or mask {outline} is not {camera}")
-        write_image(directory / "ims" / name / f"{t:06d}.{image_format}", image)
-        if mask is not None:
-            write_png(directory / "seg" / name / f"{t:06d}.png", to_gray(mask))
+        write_frame(directory, name, t, image, mask, image_format)
         written.add((name, t))
     if len(written) != n_frames * len(shown):
         raise ValueError(f"{len(written)} of {n_frames * len(shown)} images were given")
@@ -71,6 +69,20 @@ def write_scene(
         )
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
     write_model(directory / "scene.json", meta.model_copy(update={"sizes": sizes}))
+
+
+def write_frame(
+    directory: Path,
+    camera: str,
+    t: int,
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    image_format: str = "png",
+) -> None:
+    """Write what `camera` shows at timestep `t`, uint8 [H, W, 3], and its liquid mask [H, W], if it has one."""
+    write_image(directory / "ims" / camera / f"{t:06d}.{image_format}", image)
+    if mask is not None:
+        write_png(directory / "seg" / camera / f"{t:06d}.png", to_gray(mask))
 
 
 def to_gray(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ about calibration, synchronisation or masks is wrong. Scene units are metres, y 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,10 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory
 from splashbench.files.ply import write_mesh
 from splashbench.scene import Camera, Particles, Scene, SceneMeta, write_scene
+from splashbench.scene.writer import write_frame
 from splashbench.synth.imaging.geometry import Mesh, basin_mesh, bowl_mesh, dish_mesh, tank_mesh
 from splashbench.synth.imaging.lens import LensCamera
-from splashbench.synth.imaging.rendering import RoomView, TracedRoom
+from splashbench.synth.imaging.rendering import RoomView, TracedRoom, view_bytes
 from splashbench.synth.imaging.room import CaptureRoom, dish_room, glossy_room, pour_room, tank_room
 from splashbench.synth.liquid import simulation
 from splashbench.synth.liquid.simulation import Pour
@@ -30,12 +31,15 @@ from splashbench.synth.liquid.surface import liquid_surface
 from splashbench.synth.liquid.trajectory import Trajectory
 from splashbench.synth.recording.plan import CAMERAS, GRAVITY, TEST, TRAIN, RecordingOptions, make_plan
 from splashbench.synth.recording.video import SensorNoise
+from splashbench.synth.workers import Workers, worker_count
 
 _POINTS_PER_VIEW = 4000
 _SOURCE_FRAME_MS = 1000 / 60
 _LONGEST_SECONDS = 10.0
 # The simulation runs on for a moment, so that the last frame too lies between two of its snapshots.
 _AFTER_SECONDS = 0.02
+# Pixels of all frames from which processes are worth their start, some seconds.
+_WORTH_WORKERS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -143,12 +147,15 @@ def make_scene(
     dye: str | None = None,
     times_alone: bool = False,
     replace_existing: bool = False,
+    workers: int | None = None,
 ) -> Scene:
     """Make the scene `name` of `RECIPES` in the new folder `out`, with `timesteps` frames of `size` (width, height).
 
     `particle_radius` in metres replaces the recipe's own; `step_ms` milliseconds between all frames, its time steps;
     `dye`, a name or color as `dye_named` takes it, the liquid's. Two scenes that differ by it alone show one pour.
     `times_alone`: scene.json tells neither scale, gravity nor the container's mesh, as of footage that nobody measured.
+    `workers`: processes that film, by default one for each core where that is worth their start. What they film does
+    not depend on how many there are.
     Raises SplashbenchError for an unknown name, for frames that last too long, or when the liquid solver cannot run.
     """
     if name not in RECIPES:
@@ -191,15 +198,19 @@ def make_scene(
             trajectory = running.finish()
         finally:
             running.stop()
-        room = TracedRoom(_with_dye(recipe.container.room(seed), dyed))
-        views = {camera: RoomView(room, lens, samples=1) for camera, lens in lenses.items()}
+        film = SceneFilm(name, dyed, seed, lenses, _Liquid(trajectory, shown, radius), staging, Path(scratch))
+        with Workers(_worker_count(workers, lenses, timesteps), film, made=str(out)) as crew:
+            views = dict(zip(CAMERAS, crew.each([(SceneFilm.see, (camera,)) for camera in CAMERAS], "empty room")))
+            crew.each([(SceneFilm.reconstruct, (t,)) for t in range(timesteps)], "liquid surfaces")
+            crew.film(dict.fromkeys(CAMERAS, timesteps), SceneFilm.shoot, "frames")
         write_scene(
             staging,
             cameras={camera: Camera(camera, *size, lens.K, lens.w2c) for camera, lens in lenses.items()},
             train=TRAIN,
             test=TEST,
             n_frames=timesteps,
-            frames=_frames(room, lenses, trajectory, shown, pour.particle_radius, seed),
+            frames=(),
+            shown=(),
             meta=SceneMeta(
                 name=f"synthetic_{name}" + ("" if dye is None else f"_{dye.lstrip('#')}"),
                 times=(shown - shown[0]).tolist(),
@@ -230,32 +241,94 @@ def _pinhole(camera: LensCamera) -> LensCamera:
     return replace(camera, distortion=np.zeros(5))
 
 
-def _frames(
-    room: TracedRoom,
-    lenses: dict[str, LensCamera],
-    trajectory: Trajectory,
-    shown: NDArray[np.float64],
-    particle_radius: float,
-    seed: int,
-) -> Iterator[tuple[str, int, NDArray[np.uint8], NDArray[np.bool_]]]:
-    surfaces = []
-    for time in shown:
-        positions, _, active = trajectory.at(float(time))
-        surfaces.append(liquid_surface(positions[active], particle_radius))
-    for k, (camera, lens) in enumerate(lenses.items()):
-        view = RoomView(room, lens)
-        noise = SensorNoise(lens.width, lens.height, (seed, 30, k))
-        for t, surface in enumerate(surfaces):
+@dataclass(frozen=True, eq=False)
+class _Liquid:
+    """What moves: instants `shown` [T] of a `trajectory` in seconds, and the radius of its particles in metres."""
+
+    trajectory: Trajectory
+    shown: NDArray[np.float64]
+    particle_radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class _EmptyRoom:
+    """What a camera sees without liquid: container_mask bool [H, W], points [N, 3] and their colors [N, 3]."""
+
+    container_mask: NDArray[np.bool_]
+    points: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+class SceneFilm:
+    """Films the scene `name`: a worker's own. Liquid surfaces lie in the folder `scratch`, images go to `staging`."""
+
+    def __init__(
+        self,
+        name: str,
+        dye: Dye | None,
+        seed: int,
+        lenses: dict[str, LensCamera],
+        liquid: _Liquid,
+        staging: Path,
+        scratch: Path,
+    ) -> None:
+        self._name, self._dye, self._seed, self._lenses = name, dye, seed, lenses
+        self._liquid, self._staging, self._scratch = liquid, staging, scratch
+        self._room: TracedRoom | None = None
+        self._set_up: tuple[str, RoomView, SensorNoise] | None = None
+
+    def _traced(self) -> TracedRoom:
+        if self._room is None:
+            self._room = TracedRoom(_with_dye(RECIPES[self._name].container.room(self._seed), self._dye))
+        return self._room
+
+    def see(self, camera: str) -> _EmptyRoom:
+        """The room without liquid, as `camera` sees it."""
+        view = RoomView(self._traced(), self._lenses[camera], samples=1)
+        return _EmptyRoom(view.container_mask, *view.seen_points())
+
+    def _surface(self, t: int) -> Path:
+        return self._scratch / f"surface_{t:06d}.npz"
+
+    def reconstruct(self, t: int) -> None:
+        """Make the liquid's surface at timestep `t`."""
+        positions, _, active = self._liquid.trajectory.at(float(self._liquid.shown[t]))
+        surface = liquid_surface(positions[active], self._liquid.particle_radius)
+        if surface is not None:
+            np.savez(self._surface(t), vertices=surface.vertices, faces=surface.faces, normals=surface.normals)
+
+    def shoot(self, camera: str, frames: range) -> None:
+        """Film some frames of `camera`, and write them with their masks."""
+        if self._set_up is None or self._set_up[0] != camera:
+            self._set_up = None  # large
+            lens, number = self._lenses[camera], list(self._lenses).index(camera)
+            noise = SensorNoise(lens.width, lens.height, (self._seed, 30, number))
+            self._set_up = camera, RoomView(self._traced(), lens), noise
+        _, view, noise = self._set_up
+        for t in frames:
+            surface = None
+            if self._surface(t).exists():
+                with np.load(self._surface(t)) as stored:
+                    surface = Mesh(stored["vertices"], stored["faces"], stored["normals"])
             frame = view.with_liquid(surface)
-            yield camera, t, noise.expose(frame.image), frame.mask
+            write_frame(self._staging, camera, t, noise.expose(frame.image, t), frame.mask)
 
 
-def _initial_points(views: list[RoomView], seed: int) -> NDArray[np.float32]:
+def _worker_count(asked: int | None, lenses: dict[str, LensCamera], timesteps: int) -> int:
+    """Processes that film: as many as `asked` for, else one for each core, where there is enough to film."""
+    width, height = next((lens.width, lens.height) for lens in lenses.values())
+    if asked is None and width * height * len(lenses) * timesteps < _WORTH_WORKERS:
+        return 1
+    most = 2 * len(lenses)  # more would set up cameras for a handful of frames
+    return min(asked, most) if asked else worker_count(view_bytes(width, height), most)
+
+
+def _initial_points(views: list[_EmptyRoom], seed: int) -> NDArray[np.float32]:
     """Points of the room [N, 7] that the training views see: x, y, z, r, g, b, and 0 for "not liquid"."""
     rng = np.random.default_rng([seed, 31])
     gathered = []
     for view in views:
-        points, colors = view.seen_points()
+        points, colors = view.points, view.colors
         chosen = rng.choice(len(points), min(_POINTS_PER_VIEW, len(points)), replace=False)
         gathered.append(np.concatenate([points[chosen], colors[chosen], np.zeros((len(chosen), 1))], axis=1))
     return np.concatenate(gathered).astype(np.float32)

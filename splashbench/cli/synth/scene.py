@@ -73,6 +73,12 @@ def register(actions: argparse._SubParsersAction) -> None:
         action="store_true",
         help="tell neither scale, gravity nor the container's mesh, as of footage that nobody measured",
     )
+    parser.add_argument(
+        "--workers",
+        type=whole_number(1),
+        metavar="N",
+        help="number of processes that film (default: one per core, as far as memory goes)",
+    )
     add_seed(parser, "decides poses, lenses and noise")
     add_replace(parser)
 
@@ -85,6 +91,7 @@ def make(arguments: argparse.Namespace) -> int:
             ("--particle-radius", arguments.particle_radius),
             ("--dye", arguments.dye),
             ("--times-alone", arguments.times_alone or None),
+            ("--workers", arguments.workers),
         ):
             if value is not None:
                 raise SplashbenchError(f"{option} is for simulated scenes, and balls is not one; leave it out")
@@ -111,6 +118,7 @@ def make(arguments: argparse.Namespace) -> int:
             dye=arguments.dye,
             times_alone=arguments.times_alone,
             replace_existing=arguments.replace,
+            workers=arguments.workers,
         )
     if arguments.json:
         emit({"scene": str(arguments.out), "name": scene.name, "frames": scene.n_frames, "digest": scene.digest})

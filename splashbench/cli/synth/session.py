@@ -46,7 +46,10 @@ def register(actions: argparse._SubParsersAction) -> None:
         help="radius of the simulated particles (default: 0.003)",
     )
     parser.add_argument(
-        "--workers", type=whole_number(1), metavar="N", help="number of processes that render (default: one per core)"
+        "--workers",
+        type=whole_number(1),
+        metavar="N",
+        help="number of processes that film (default: one per core, as far as memory goes)",
     )
     add_replace(parser)
 

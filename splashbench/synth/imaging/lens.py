@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# Rows of rays that are made at once: in double precision, those of a large image would take gigabytes.
+_STRIP = 64
+
 
 @dataclass(frozen=True, eq=False)
 class LensCamera:
@@ -38,19 +41,28 @@ class LensCamera:
         uv = distort(local[:, :2] / local[:, 2:], self.distortion)
         return uv @ self.K[:2, :2].T + self.K[:2, 2], local[:, 2]
 
-    def local_rays(self, samples: int) -> Array:
-        """Undistorted normalised coordinates [H * samples, W * samples, 2] of a grid of points in every pixel."""
+    def local_rays(self, samples: int, rows: range | None = None) -> Array:
+        """Undistorted normalised coordinates [H * samples, W * samples, 2] of a grid of points in every pixel; or of
+        the grid's `rows` alone."""
         x = (np.arange(self.width * samples) + 0.5) / samples
-        y = (np.arange(self.height * samples) + 0.5) / samples
+        y = (np.asarray(range(self.height * samples) if rows is None else rows) + 0.5) / samples
         u, v = np.meshgrid((x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1])
         return undistort(np.stack([u, v], axis=-1), self.distortion)
 
-    def rays(self, samples: int) -> NDArray[np.float32]:
-        """Unit view directions in the world [H * samples, W * samples, 3]."""
-        local = self.local_rays(samples)
-        directions = np.concatenate([local, np.ones_like(local[..., :1])], axis=-1) @ self.w2c[:3, :3]
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        return directions.astype(np.float32)
+    def rays(self, samples: int, local: Array | None = None) -> NDArray[np.float32]:
+        """Unit view directions in the world [H * samples, W * samples, 3].
+
+        local: the `local_rays` of so many samples, where they are known from the same lens in another place.
+        """
+        height, width = self.height * samples, self.width * samples
+        rays = np.empty((height, width, 3), np.float32)
+        for start in range(0, height, _STRIP):
+            rows = range(start, min(start + _STRIP, height))
+            strip = self.local_rays(samples, rows) if local is None else local[rows.start : rows.stop]
+            directions = np.concatenate([strip, np.ones_like(strip[..., :1])], axis=-1) @ self.w2c[:3, :3]
+            directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+            rays[rows.start : rows.stop] = directions
+        return rays
 
 
 def distort(normalised: Array, coefficients: Array) -> Array:
@@ -71,6 +83,8 @@ def distort(normalised: Array, coefficients: Array) -> Array:
 def undistort(distorted: Array, coefficients: Array, iterations: int = 12) -> Array:
     """Inverse of `distort` by fixed-point iteration, which converges fast for the mild lenses here."""
     guess = distorted
+    if not np.any(coefficients):
+        return guess
     for _ in range(iterations):
         guess = guess + (distorted - distort(guess, coefficients))
     return guess

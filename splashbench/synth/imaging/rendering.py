@@ -28,8 +28,16 @@ _OFFSET = np.float32(4e-4)  # metres from a surface at which its shadow rays sta
 _BEYOND = np.float32(5e-5)  # metres behind one crossing of the liquid's surface at which the next is looked for
 _OPENNESS_RAYS = 16
 _RIM = 32  # pixels beyond the image from which a surface can still reach into it
+# What a view takes of memory for each pixel while it is set up, and what the process has beside it.
+_VIEW_PIXEL_BYTES, _PROCESS_BYTES = 750, 400 << 20
 _LONGEST_EDGE = 0.006  # metres
+_AT_ONCE = 1 << 19  # samples that are cast at once: all of a large image would take gigabytes
 _CROSSINGS = 6  # of the liquid's surface that are followed along a ray through clear liquid
+
+
+def view_bytes(width: int, height: int) -> int:
+    """Memory that a process takes at most which films with a camera of this size in pixels."""
+    return _PROCESS_BYTES + width * height * _VIEW_PIXEL_BYTES
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,15 +109,50 @@ class TracedRoom:
 
 
 class RoomView:
-    """A room seen by one camera. Arrays of samples are [P, s * s, ...]: P = H * W pixels, and the samples in each."""
+    """A room seen by one camera. Arrays of samples are [P, s * s, ...]: P = H * W pixels, and the samples in each.
 
-    def __init__(self, traced: TracedRoom, camera: LensCamera, samples: int = SAMPLES) -> None:
+    local_rays: the camera's own, of so many samples, where they are known (`LensCamera.local_rays`).
+    """
+
+    def __init__(
+        self,
+        traced: TracedRoom,
+        camera: LensCamera,
+        samples: int = SAMPLES,
+        local_rays: NDArray[np.float64] | None = None,
+    ) -> None:
         self.traced, self.camera = traced, camera
         height, width, s = camera.height, camera.width, samples
-        by_pixel = camera.rays(s).reshape(height, s, width, s, 3).transpose(0, 2, 1, 3, 4)
+        by_pixel = camera.rays(s, local_rays).reshape(height, s, width, s, 3).transpose(0, 2, 1, 3, 4)
         self._directions = np.ascontiguousarray(by_pixel).reshape(height * width, s * s, 3)
         self._eye = camera.center.astype(np.float32)
-        directions = self._directions.reshape(-1, 3)
+        shape = self._directions.shape
+        self._distance, self._lit = np.empty(shape[:2], np.float32), np.empty(shape[:2], np.bool_)
+        self._lifted, self._color, self._shade = (np.empty(shape, np.float32) for _ in range(3))
+        on_bowl = np.empty(shape[:2], np.bool_)
+        step = max(1, _AT_ONCE // (s * s))
+        for start in range(0, len(on_bowl), step):
+            block = slice(start, start + step)
+            seen = self._seen(self._directions[block].reshape(-1, 3), s)
+            stored = self._distance, self._lifted, self._lit, on_bowl, self._color, self._shade
+            for array, values in zip(stored, seen):
+                array[block] = values.reshape(array[block].shape)
+        self._on_bowl = on_bowl.any(axis=1)
+        color, on_container = self._color, on_bowl
+        self._panes = None
+        if traced.glass is not None:
+            self._panes = traced.glass.along(self._eye, self._directions.reshape(-1, 3))
+            color = self._panes.through(color.reshape(-1, 3), 0.0, FAR).reshape(shape)
+            on_container = self._panes.met.reshape(shape[:2])
+        self.image = to_srgb(_sample_means(color)).reshape(height, width, 3)
+        """The room without liquid: float32 [H, W, 3] sRGB in [0, 1]."""
+        self.container_mask = (on_container.mean(axis=1) >= 0.5).reshape(height, width)
+        """Where the container is seen: bool [H, W]."""
+
+    def _seen(self, directions: Vectors, samples: int) -> tuple[NDArray, ...]:
+        """What rays of whole pixels meet: distance, a point just before it, whether the lamp reaches it, whether it is
+        the bowl, and its colour in light and in shadow. directions: [R, 3], `samples` squared to each pixel."""
+        traced, s = self.traced, samples
         hits = traced.tracer.nearest(self._eye, directions)
         hit = hits.geometry >= 0
         # Beyond the room: a ray that met nothing counts as a far, grey, upright wall.
@@ -129,20 +172,10 @@ class RoomView:
             coat, view = traced.room.glaze, directions[on_bowl]
             share = coat.share(normal[on_bowl], view)
             light[on_bowl] = (1 - share) * light[on_bowl] + coat.glint(normal[on_bowl], view, lamp)
-            seen = traced.mirrored(lifted[on_bowl], shading.mirrored(normal[on_bowl], view))
-            shade[on_bowl] = (1 - share) * shade[on_bowl] + share * seen
+            mirrored = traced.mirrored(lifted[on_bowl], shading.mirrored(normal[on_bowl], view))
+            shade[on_bowl] = (1 - share) * shade[on_bowl] + share * mirrored
         color = shade + np.where(lit[:, None], light, 0)
-        self._panes = traced.glass.along(self._eye, directions) if traced.glass is not None else None
-        on_container = on_bowl if self._panes is None else self._panes.met
-        self._distance = hits.distance.reshape(-1, s * s)
-        self._lifted, self._color, self._shade = (a.reshape(-1, s * s, 3) for a in (lifted, color, shade))
-        self._lit, self._on_bowl = lit.reshape(-1, s * s), on_bowl.reshape(-1, s * s).any(axis=1)
-        if self._panes is not None:
-            color = self._panes.through(color, 0.0, FAR)
-        self.image = to_srgb(_sample_means(color.reshape(-1, s * s, 3))).reshape(height, width, 3)
-        """The room without liquid: float32 [H, W, 3] sRGB in [0, 1]."""
-        self.container_mask = on_container.reshape(height, width, s * s).mean(axis=2) >= 0.5
-        """Where the container is seen: bool [H, W]."""
+        return hits.distance, lifted, lit, on_bowl, color, shade
 
     def seen_points(self) -> tuple[Vectors, Vectors]:
         """What the pixels that meet the room see: points [N, 3] in the world and their sRGB colours [N, 3]."""
@@ -203,7 +236,8 @@ class RoomView:
         lifted = points + _OFFSET * hits.normal[first]
         room = self.traced.room
         towards = np.broadcast_to(room.light.towards, points.shape)
-        lit = ~(tracer.occluded(lifted, towards) | self.traced.tracer.occluded(lifted, towards))
+        lit = ~tracer.occluded(lifted, towards)
+        lit[lit] = ~self.traced.tracer.occluded(lifted[lit], towards[lit])
         wet = first.reshape(color.shape[:2])
         alone = np.ones(len(points), np.float32)
         openness = shading.bowl_openness(points, room.bowl_shape) if room.bowl is not None else alone

@@ -5,8 +5,6 @@ Every job seeds its own random numbers from the session's seed, so the result do
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splashbench.files import write_png
-from splashbench.processes import end_with_parent
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom
 from splashbench.synth.imaging.room import pour_room, static_room
 from splashbench.synth.liquid.surface import liquid_surface
@@ -32,15 +29,6 @@ STATIC_FILE = "cameras/{}/static/GX010002.MP4"
 POUR_FILE = "cameras/{}/pour/GX{:02d}0003.MP4"
 SWEEP_FILE = "sweep/GX010001.MP4"
 _SWEEP_SAMPLES = 2
-
-
-def prepare_worker() -> None:
-    """Keep a worker to one core, as the workers together fill the machine, and let it end with its parent."""
-    import cv2
-
-    end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of them; the parent alone answers
-    cv2.setNumThreads(1)
 
 
 @lru_cache(maxsize=1)
@@ -86,9 +74,10 @@ def static_clip(plan: RecordingPlan, name: str, session: Path) -> None:
 def sweep_frames(plan: RecordingPlan, frames: range) -> list[Frame]:
     """Some frames of the handheld sweep, noise included."""
     images = []
+    local_rays = plan.sweep[frames.start].local_rays(_SWEEP_SAMPLES)  # of one camera, wherever it is held
     for frame in frames:
         noise = SensorNoise(*plan.options.size, (plan.options.seed, 15, frame))
-        view = RoomView(_static_room(plan.options.seed), plan.sweep[frame], samples=_SWEEP_SAMPLES)
+        view = RoomView(_static_room(plan.options.seed), plan.sweep[frame], _SWEEP_SAMPLES, local_rays)
         images.append(noise.expose(view.image))
     return images
 
@@ -99,43 +88,64 @@ def write_sweep(plan: RecordingPlan, frames: list[Frame], session: Path) -> None
     write_recording(session / SWEEP_FILE, frames, planned.SWEEP_FPS, track)
 
 
-def pour_recording(plan: RecordingPlan, name: str, trajectory: Trajectory, session: Path) -> float:
-    """Write camera `name`'s recording of the pour and its true masks.
+class PourFilm:
+    """What the cameras record of the pour; a worker's own. Frames wait in the folder `scratch` for their camera's end.
 
-    Returns the common time at which it first sees liquid, infinity if never.
+    trajectory: of the liquid. session: folder of the session.
     """
-    recorder = plan.recorders[name]
-    view = RoomView(_pour_room(plan.options.seed), recorder.camera)
-    masks = session / "truth" / "masks" / name
-    masks.mkdir(parents=True)
-    write_png(session / "truth" / "container_masks" / f"{name}.png", _as_png(view.container_mask))
-    first_seen = [np.inf]
 
-    def frames() -> Iterator[Frame]:
-        noise = SensorNoise(*plan.options.size, _seed(plan, 17, recorder))
-        for frame in range(recorder.n_frames):
+    def __init__(self, plan: RecordingPlan, trajectory: Trajectory, session: Path, scratch: Path) -> None:
+        self._plan, self._trajectory, self._session, self._scratch = plan, trajectory, session, scratch
+        self._set_up: tuple[str, RoomView, SensorNoise] | None = None
+
+    def _camera(self, name: str) -> tuple[RoomView, SensorNoise]:
+        if self._set_up is None or self._set_up[0] != name:
+            self._set_up = None  # large
+            plan, recorder = self._plan, self._plan.recorders[name]
+            view = RoomView(_pour_room(plan.options.seed), recorder.camera)
+            self._set_up = name, view, SensorNoise(*plan.options.size, _seed(plan, 17, recorder))
+        return self._set_up[1:]
+
+    def shoot(self, name: str, frames: range) -> float:
+        """Film some frames of camera `name`, and write their true masks.
+
+        Returns the common time at which liquid is first seen in them, infinity if never.
+        """
+        recorder, (view, noise) = self._plan.recorders[name], self._camera(name)
+        truth, first_seen, images = self._session / "truth", np.inf, []
+        if frames.start == 0:
+            (truth / "masks" / name).mkdir(parents=True, exist_ok=True)  # of a camera that sees no liquid as well
+            write_png(truth / "container_masks" / f"{name}.png", _as_png(view.container_mask))
+        for frame in frames:
             time = recorder.common_time(frame)
-            positions, _, active = trajectory.at(time - POUR_AT)
-            shown = view.with_liquid(liquid_surface(positions[active], plan.pour.particle_radius))
+            positions, _, active = self._trajectory.at(time - POUR_AT)
+            shown = view.with_liquid(liquid_surface(positions[active], self._plan.pour.particle_radius))
             if shown.mask.any():
-                write_png(masks / f"{frame:06d}.png", _as_png(shown.mask))
-                first_seen[0] = min(first_seen[0], time)
-            yield noise.expose(shown.image)
+                write_png(truth / "masks" / name / f"{frame:06d}.png", _as_png(shown.mask))
+                first_seen = min(first_seen, time)
+            images.append(noise.expose(shown.image, frame))
+        np.save(self._scratch / f"{name}_{frames.start:06d}.npy", np.stack(images))
+        return first_seen
 
-    track = record(recorder.microphone, plan.sources, recorder.n_frames / recorder.fps)
-    exposed = frames()
-    start = 0
-    for chapter, stop in enumerate(_chapter_ends(recorder), start=1):
-        samples = slice(round(start * SAMPLE_RATE / recorder.fps), round(stop * SAMPLE_RATE / recorder.fps))
-        write_recording(
-            session / POUR_FILE.format(name, chapter),
-            (next(exposed) for _ in range(start, stop)),
-            recorder.fps,
-            track[samples],
-            **_stamps(recorder, start),
-        )
-        start = stop
-    return first_seen[0]
+    def finish(self, name: str) -> None:
+        """Write the recording of camera `name`, all of whose frames have been filmed."""
+        plan, recorder = self._plan, self._plan.recorders[name]
+        blocks = sorted(self._scratch.glob(f"{name}_*.npy"))
+        exposed = (frame for block in blocks for frame in np.load(block))
+        track = record(recorder.microphone, plan.sources, recorder.n_frames / recorder.fps)
+        start = 0
+        for chapter, stop in enumerate(_chapter_ends(recorder), start=1):
+            samples = slice(round(start * SAMPLE_RATE / recorder.fps), round(stop * SAMPLE_RATE / recorder.fps))
+            write_recording(
+                self._session / POUR_FILE.format(name, chapter),
+                (next(exposed) for _ in range(start, stop)),
+                recorder.fps,
+                track[samples],
+                **_stamps(recorder, start),
+            )
+            start = stop
+        for block in blocks:
+            block.unlink()
 
 
 def _chapter_ends(recorder: RigCamera) -> list[int]:

@@ -6,12 +6,7 @@ know.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import tempfile
-from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +16,26 @@ from splashbench import toml
 from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, write_model
 from splashbench.files.ply import write_mesh
-from splashbench.progress import track
 from splashbench.synth.imaging.geometry import bowl_mesh
+from splashbench.synth.imaging.rendering import view_bytes
 from splashbench.synth.imaging.room import board_pose
 from splashbench.synth.liquid import simulation
 from splashbench.synth.liquid.trajectory import Trajectory
 from splashbench.synth.recording import jobs
 from splashbench.synth.recording import plan as planned
+from splashbench.synth.recording.jobs import PourFilm
 from splashbench.synth.recording.plan import BOARD, CAMERAS, RecordingOptions, RecordingPlan, make_plan
 from splashbench.synth.recording.truth import TruthCamera, TruthFile, TruthLens, TruthPour, TruthSound
+from splashbench.synth.workers import Job, Workers, worker_count
 
 PARTICLE_HZ = 240  # cubic interpolation between the stored instants is then good to about 0.1 mm
 _SWEEP_CHUNK = 11
 
 
 def make_session(out: Path, options: RecordingOptions, replace: bool = False, workers: int | None = None) -> Path:
-    """Make a session in the new folder `out` with `workers` processes (default: one per core); returns `out`.
+    """Make a session in the new folder `out` with `workers` processes; returns `out`.
+
+    By default there is one for each core, as far as memory goes.
 
     Raises SplashbenchError when the liquid solver cannot run or `out` exists and `replace` is false.
     """
@@ -45,63 +44,41 @@ def make_session(out: Path, options: RecordingOptions, replace: bool = False, wo
         atomic_directory(Path(out), replace=replace, holds="truth/truth.json") as directory,
         tempfile.TemporaryDirectory(prefix="splashbench-") as scratch,
     ):
+        most = 2 * len(CAMERAS)  # more would set up cameras for a handful of frames
+        count = min(workers, most) if workers else worker_count(view_bytes(*options.size), most)
         running = simulation.start(plan.pour, bowl_mesh(), Path(scratch))
         try:
-            with _pool(workers) as pool:
-                _still_recordings(pool, plan, directory)
-                trajectory = running.finish()
-                first_seen = _pour_recordings(pool, plan, trajectory, directory)
-        except BrokenProcessPool:
-            raise SplashbenchError(
-                f"a worker process died while making {out}, most likely for want of memory; "
-                "give a smaller --size or close other programs"
-            ) from None
+            with Workers(count, plan, made=str(out)) as still:
+                _still_recordings(still, plan, directory)
+            trajectory = running.finish()
         finally:
             running.stop()
+        first_seen = _pour_recordings(count, plan, trajectory, directory, Path(scratch))
         _write_truth(plan, trajectory, first_seen, directory)
         (directory / "session.toml").write_text(toml.dumps(_description(plan)), encoding="utf-8")
     return Path(out)
 
 
-def _pool(workers: int | None) -> ProcessPoolExecutor:
-    count = workers or max(1, len(os.sched_getaffinity(0)))
-    # Spawned, not forked: the libraries used here start threads, which a fork would leave in an undefined state.
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(min(count, len(CAMERAS)), mp_context=context, initializer=jobs.prepare_worker)
-
-
-def _gather(futures: list[Future[Any]], description: str) -> None:
-    """Wait for all with a bar; the first failure ends the rest."""
-    try:
-        for future in track(as_completed(futures), description, total=len(futures)):
-            future.result()
-    except BaseException:
-        for future in futures:
-            future.cancel()
-        # Leaving the pool would wait for what is under way, which takes minutes.
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-
-
-def _still_recordings(pool: ProcessPoolExecutor, plan: RecordingPlan, directory: Path) -> None:
+def _still_recordings(workers: Workers[RecordingPlan], plan: RecordingPlan, directory: Path) -> None:
     """Sweep, static scene and calibration clips: all that needs no liquid."""
     chunks = [
         range(start, min(start + _SWEEP_CHUNK, planned.SWEEP_FRAMES))
         for start in range(0, planned.SWEEP_FRAMES, _SWEEP_CHUNK)
     ]
-    sweep = [pool.submit(jobs.sweep_frames, plan, chunk) for chunk in chunks]
-    makers: list[Callable[[RecordingPlan, str, Path], None]] = [jobs.static_clip, jobs.intrinsics_clip]
-    clips: list[Future[Any]] = [pool.submit(maker, plan, name, directory) for maker in makers for name in CAMERAS]
-    _gather([*sweep, *clips], "static scene, sweep and boards")
-    jobs.write_sweep(plan, [frame for chunk in sweep for frame in chunk.result()], directory)
+    sweep: list[Job] = [(jobs.sweep_frames, (chunk,)) for chunk in chunks]
+    clips: list[Job] = [
+        (maker, (name, directory)) for maker in (jobs.static_clip, jobs.intrinsics_clip) for name in CAMERAS
+    ]
+    made = workers.each([*sweep, *clips], "static scene, sweep and boards")
+    jobs.write_sweep(plan, [frame for chunk in made[: len(sweep)] for frame in chunk], directory)
 
 
-def _pour_recordings(pool: ProcessPoolExecutor, plan: RecordingPlan, trajectory: Trajectory, directory: Path) -> float:
+def _pour_recordings(count: int, plan: RecordingPlan, trajectory: Trajectory, directory: Path, scratch: Path) -> float:
     """All cameras' recordings of the pour; returns the common time at which liquid comes into view."""
-    recordings = [pool.submit(jobs.pour_recording, plan, name, trajectory, directory) for name in CAMERAS]
-    _gather(list(recordings), "pour recordings")
-    return min(future.result() for future in recordings)
+    film = PourFilm(plan, trajectory, directory, scratch)
+    frames = {name: recorder.n_frames for name, recorder in plan.recorders.items()}
+    with Workers(count, film, made=str(directory)) as workers:
+        return float(min(workers.film(frames, PourFilm.shoot, "pour recordings", PourFilm.finish)))
 
 
 def _write_truth(plan: RecordingPlan, trajectory: Trajectory, first_seen: float, directory: Path) -> None:

@@ -30,10 +30,17 @@ class SensorNoise:
         self._size = (height, width)
         shape = (height + _NOISE_MARGIN, width + _NOISE_MARGIN, 3)
         self._tile = (level * self._rng.standard_normal(shape)).astype(np.float32)
+        self._corners: list[tuple[int, int]] = []
+        self._next = 0
 
-    def expose(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """An sRGB image [H, W, 3] in [0, 1] as a noisy 8-bit frame."""
-        row, column = self._rng.integers(0, _NOISE_MARGIN, 2)
+    def expose(self, image: NDArray[np.float32], frame: int | None = None) -> NDArray[np.uint8]:
+        """An sRGB image [H, W, 3] in [0, 1] as a noisy 8-bit frame. `frame`: its number; by default the next one."""
+        frame = self._next if frame is None else frame
+        self._next = frame + 1
+        while len(self._corners) <= frame:
+            drawn = self._rng.integers(0, _NOISE_MARGIN, 2)
+            self._corners.append((int(drawn[0]), int(drawn[1])))
+        row, column = self._corners[frame]
         height, width = self._size
         noise = self._tile[row : row + height, column : column + width]
         noisy = 255 * image + noise * (1.25 - 0.5 * image)
