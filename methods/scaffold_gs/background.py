@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +58,12 @@ class Background:
 
     def seen_by(self, scene: TrainingScene) -> dict[str, NDArray[np.float32]]:
         """What the training views of `scene` show of it, float32 [H, W, 3] each; see `render`."""
-        return {name: np.asarray(self.render(camera), dtype=np.float32) for name, camera in scene.cameras.items()}
+        return dict(self.views(scene))
+
+    def views(self, scene: TrainingScene) -> Iterator[tuple[str, NDArray[np.float32]]]:
+        """The same one after the other: name and image of each view, which is rendered when it is asked for."""
+        for name, camera in scene.cameras.items():
+            yield name, np.asarray(self.render(camera), dtype=np.float32)
 
     def depth(self, camera: Camera) -> NDArray[np.float32]:
         """Expected depth along the optical axis of `camera`, float32 [H, W], scene units; inf where nothing lies.

@@ -84,7 +84,12 @@ def begin(
         }
         with_smaller(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
     memory.give_back()
-    look = photographed(traced.track, targets) if targets and config.first_look else None
+    look = None
+    if targets and config.first_look:
+        # Half-size photographs say as much, and are there already.
+        look = photographed(traced.track, [target.coarse or target for target in targets])
+    if occlusion is not None:
+        occlusion.forget()
     memory.give_back()
     count, voxel = traced.track.carriers.count, observations.grid.voxel
     appearance = initial_appearance(count, voxel, config.optimisation, config.decoder, seed)
@@ -104,8 +109,8 @@ def begin(
     elif look is not None:
         take_on(look, appearance.features, appearance.decoder)
     if device != CPU:
-        set_backgrounds(targets, backgrounds, device)
-        set_smaller_backgrounds(targets, backgrounds, device)
+        set_backgrounds(targets, backgrounds.items(), device)
+        set_smaller_backgrounds(targets, backgrounds.items(), device)
     memory.give_back()
     return Beginning(appearance, targets, look, settings)
 

@@ -32,6 +32,7 @@ from splashbench.selfcalibration import hardly_masked, self_calibration
 
 from .affordable import affords_self_calibration, background_update, within_bytes, within_seconds
 from .affordable_memory import within_memory
+from .appearance.targets import Views
 from .appearance.warm_start import Learned
 from .coarse_fit import begins_on_coarse_grids, fit_coarsely
 from .draft import State, make_draft
@@ -253,12 +254,13 @@ class Course:
     ) -> State:
         """The appearance, on the grids that stay. late: gives the background where `behind` has stand-ins for it."""
         run = self._run
-        settled: Callable[[], Backgrounds] | None = None
+        settled: Callable[[], Views] | None = None
         if late is not None:
 
-            def settled() -> Backgrounds:
+            def settled() -> Views:
                 self._background = late()
-                return self._background.seen_by(self._scene)
+                self._plates = _plates_of(self._scene)  # those that were made are large, and nobody asks again
+                return self._background.views(self._scene)
 
         offer = None if self._show is None else self._offer
         span = (start, 1.0)

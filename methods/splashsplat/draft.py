@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from splashbench.gaussians.torch_threads import one_torch_thread
 from splashbench.harness.contract import Run
 from splashbench.scene.scene import TrainingScene
 
+from .appearance.targets import Views
 from .fields.container import KnownContainer
 from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
@@ -55,13 +54,13 @@ def make_draft(
     background = flat_background(first)
     coarse = draft_of(config, opaque)
 
-    def settled() -> dict[str, np.ndarray]:
+    def settled() -> Views:
         nonlocal background
         settings = BackgroundSettings(iterations=_ITERATIONS, max_anchors=_ANCHORS, longest_side=_LONGEST_SIDE)
         with one_torch_thread():
             background = fit_background(scene, settings, run)
         # Plates are sharper than so coarse a background.
-        return completed(plates(), background)
+        return completed(plates(), background).items()
 
     def offer_state(state: Callable[[], Reconstruction], milestone: bool) -> None:
         offer(lambda: complete(state()), milestone)

@@ -24,7 +24,7 @@ from .appearance.fitting import Appearance, Fit, fit_appearance, visible_carrier
 from .appearance.iterations import iterations_decision
 from .appearance.schedule import Clock
 from .appearance.sensitivity import Sensitivity
-from .appearance.targets import set_backgrounds
+from .appearance.targets import Views, release_backgrounds, set_backgrounds
 from .appearance.warm_start import Learned
 from .beginning import Beginning, begin
 from .carriers.subframe import Track
@@ -60,18 +60,19 @@ def fit_liquid(
     span: tuple[float, float] = (0.0, 1.0),
     frozen: Mapping[str, Frozen] | None = None,
     offer: Callable[[Callable[[], Reconstruction], bool], None] | None = None,
-    settled: Callable[[], dict[str, np.ndarray]] | None = None,
+    settled: Callable[[], Views] | None = None,
     room: Callable[[], int] | None = None,
     learned: list[Learned] | None = None,
     keep: Callable[[Learned], None] | None = None,
 ) -> Reconstruction:
     """Fit the appearance of the liquid of `scene`; returns it, and what hides it from cameras.
 
-    backgrounds: float32 [H, W, 3] of every training view, in [0, 1], and emptied once there are others (`settled`); or
-    [3] where `frozen` has the background's Gaussians of every view, to be drawn together with the liquid's. span: the
-    part of `run`'s progress this takes up. offer: is given, after iterations of the appearance, what makes the
-    reconstruction as if the fit ended there, and whether there will be no other for a while. settled: where given,
-    `backgrounds` are for the first iterations (`plates_share`), and this gives those for the others.
+    backgrounds: float32 [H, W, 3] of every training view, in [0, 1], and emptied once nobody needs them any more
+    (`settled`); or [3] where `frozen` has the background's Gaussians of every view, to be drawn together with the
+    liquid's. span: the part of `run`'s progress this takes up. offer: is given, after iterations of the appearance,
+    what makes the reconstruction as if the fit ended there, and whether there will be no other for a while. settled:
+    where given, `backgrounds` are for the first iterations (`plates_share`), and this gives those for the others, as
+    often as it is asked.
     room: where given, the bytes that the liquid may take, asked for at the end. learned: on coarser grids, to begin
     with; taken out of the list, as it is large. keep: is given what was learned of all carriers, where there is any
     photograph.
@@ -169,7 +170,7 @@ def _fit(
     run: Run,
     span: tuple[float, float],
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None,
-    settled: Callable[[], dict[str, np.ndarray]] | None,
+    settled: Callable[[], Views] | None,
     clock: Clock | None,
 ) -> Fit | None:
     """Fit the appearance of the `beginning` to its photographs, in place; None where there are none. The others: see
@@ -178,12 +179,23 @@ def _fit(
     if not targets:
         return None
 
+    # Large images are behind the smaller photographs alone until the others teach.
+    begins_small = targets[0].coarse is not None
+    if settled is not None and begins_small and beginning.settings.plates_share <= beginning.settings.coarse_share:
+        release_backgrounds(targets)
+        backgrounds.clear()
+
     def settle() -> None:
         if settled is not None:
-            behind = settled()
-            set_backgrounds(targets, behind, run.device)
-            set_smaller_backgrounds(targets, behind, run.device)
-            backgrounds.clear()  # nobody needs those of before, which are large
+            # Nobody needs those of before, which are as large as those to come.
+            release_backgrounds(targets)
+            backgrounds.clear()
+            put = set_backgrounds if targets[0].coarse is None else set_smaller_backgrounds
+            put(targets, settled(), run.device)
+
+    def enlarge() -> None:
+        if settled is not None and begins_small:
+            set_backgrounds(targets, settled(), run.device)
 
     return fit_appearance(
         beginning.appearance,
@@ -195,6 +207,7 @@ def _fit(
         lambda done: run.progress(span[0] + (span[1] - span[0]) * done, "appearance"),
         offer,
         settle,
+        enlarge,
         clock,
         run.device,
     )

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "30"
+VERSION = "31"
 
 
 class SplashSplatConfig(MethodConfig):

@@ -38,6 +38,12 @@ def floats(value: Any, name: str) -> Floats:
         return np.require(array, np.float32, ["C", "A"])
 
 
+def is_callers(array: Floats, value: Any) -> bool:
+    """Whether the `array` that `floats` made of `value` lies where that does, as it needed no conversion."""
+    place = value.data_ptr() if hasattr(value, "data_ptr") else np.asarray(value).__array_interface__["data"][0]
+    return bool(place == array.__array_interface__["data"][0])
+
+
 def check_shapes(means: Any, factors: Any, opacities: Any, colors: Any) -> int:
     """The number of colour channels; raises ValueError where the Gaussians' arrays do not fit together."""
     if np.ndim(means) != 2 or means.shape[1] != 3:

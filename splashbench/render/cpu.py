@@ -194,7 +194,7 @@ def forward(
     channels = gaussians.channels + int(depth)
     arguments.check_frozen(frozen, camera, gaussians.channels, depth)
     behind = arguments.check_background(background, camera, gaussians.channels)
-    if behind is not None and for_backward:
+    if behind is not None and for_backward and arguments.is_callers(behind, background):
         behind = behind.copy()  # read again by the backward pass, which the caller's later changes must not reach
     if behind is not None and depth:
         behind = np.concatenate([behind, np.zeros((*behind.shape[:-1], 1), np.float32)], axis=-1)

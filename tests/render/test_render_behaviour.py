@@ -304,11 +304,20 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed(camera):
         color.sum().backward()
 
 
-@pytest.mark.parametrize("shape", [(3,), (90, 170, 3)])
-def test_a_background_changed_in_place_leaves_the_gradients_alone(camera, shape):
+BACKGROUNDS = {
+    "color": lambda larger: larger[0, 0],
+    "image": lambda larger: larger[:90, :170].contiguous(),
+    "part of a larger image": lambda larger: larger[5:95, 3:173],
+    "doubles": lambda larger: larger[:90, :170].double(),
+}
+
+
+@pytest.mark.parametrize("kind", BACKGROUNDS)
+def test_a_background_changed_in_place_leaves_the_gradients_alone(camera, kind):
     gradients = []
     for change in (False, True):
-        tensors, background = tensors_of(scatter(200)), torch.rand(shape, generator=torch.Generator().manual_seed(0))
+        larger = torch.rand((100, 180, 3), generator=torch.Generator().manual_seed(0))
+        tensors, background = tensors_of(scatter(200)), BACKGROUNDS[kind](larger)
         color, _ = rasterize(*tensors, camera, background=background)
         if change:
             background.zero_()

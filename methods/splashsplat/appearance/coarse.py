@@ -18,8 +18,8 @@ from splashbench.gaussians.devices import CPU
 from splashbench.parallel import each
 
 from ..kernel.window_loss import WindowPhotograph
-from .photographs import Deferred, Photograph, Shelf, read_now
-from .targets import TrainingTarget, windowed
+from .photographs import Deferred, Photograph, Shelf, packed, read_now
+from .targets import TrainingTarget, Views, windowed
 
 #: How often photographs are halved. Windows begin at pixels that this leaves whole.
 HALVINGS = 2
@@ -52,7 +52,7 @@ def _halve(
 
     def halve(target: TrainingTarget) -> None:
         later = Deferred(partial(_read_halved, target.photograph))
-        photograph = later if shelf.full else shelf.keep(later.read())
+        photograph = later if shelf.full else packed(shelf.keep(later.read()))
         name = target.camera.name
         target.coarse = half_size(target, photograph, behind[name], before[name])
 
@@ -60,19 +60,14 @@ def _halve(
     each(halve, targets)
 
 
-def set_smaller_backgrounds(
-    targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray], device: str = CPU
-) -> None:
-    """Put others behind the smaller ones of `targets` where these have some, in place, on `device`; see
-    `with_smaller`."""
-    behind = {name: torch.from_numpy(image).to(device) for name, image in backgrounds.items()}
-    for _ in range(HALVINGS):
-        targets = [target.coarse for target in targets if target.coarse is not None]
-        if not targets:
-            return
-        behind = {name: _halved(image) for name, image in behind.items()}
-        for target in targets:
-            target.background = windowed(behind[target.camera.name], target.corner, target.camera)
+def set_smaller_backgrounds(targets: list[TrainingTarget], views: Views, device: str = CPU) -> None:
+    """Put others behind the smaller ones of `targets` where these have some, in place, on `device`."""
+    for name, image in views:
+        behind, smaller = torch.from_numpy(image).to(device), [each for each in targets if each.camera.name == name]
+        while smaller := [target.coarse for target in smaller if target.coarse is not None]:
+            behind = _halved(behind)
+            for target in smaller:
+                target.background = windowed(behind, target.corner, target.camera)
 
 
 def half_size(

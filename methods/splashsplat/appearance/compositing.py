@@ -84,18 +84,71 @@ def _behind_wall(
         return _cut(image, alpha, background, wall)
     # Children of one carrier follow each other.
     drawn_last = in_front.repeat_interleave(len(colors) // len(in_front))
+    first, last = ((~drawn_last).nonzero()[:, 0], drawn_last.nonzero()[:, 0])
+    means, factors, opacities, rgb, *before = _Parts.apply(first, last, *shapes, colors)
+    image, alpha = rasterize(means, factors, opacities, rgb, camera, background=background)
+    image, alpha = _cut(image, alpha, background, wall)
+    means, factors, opacities, rgb = before
+    over, opacity = rasterize(means, factors, opacities, rgb, camera)
+    if image.device.type != CPU:
+        return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
+    composited: tuple[Tensor, Tensor] = _Over.apply(over, opacity, image, alpha)
+    return composited
 
-    def part(chosen: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:
-        rows = chosen.nonzero()[:, 0]
-        means, factors, opacities = (values.index_select(0, rows) for values in shapes)
-        drawn: tuple[Tensor, Tensor] = rasterize(
-            means, factors, opacities, colors.index_select(0, rows), camera, background=behind
-        )
-        return drawn
 
-    image, alpha = _cut(*part(~drawn_last, background), background, wall)
-    over, opacity = part(drawn_last, None)
-    return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
+class _Parts(torch.autograd.Function):
+    """The rows `first` and the rows `last` (int64) of each table, of which every row is in one of them."""
+
+    @staticmethod
+    def forward(ctx: Any, first: Tensor, last: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(first, last)
+        return tuple(table.index_select(0, rows) for rows in (first, last) for table in tables)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *by_part: Tensor) -> tuple[Tensor | None, ...]:
+        first, last = ctx.saved_tensors
+        half = len(by_part) // 2
+        gradients = []
+        for of_first, of_last in zip(by_part[:half], by_part[half:]):
+            gradient = of_first.new_empty(len(first) + len(last), *of_first.shape[1:])
+            gradients.append(gradient.index_copy_(0, first, of_first).index_copy_(0, last, of_last))
+        return None, None, *gradients
+
+
+class _Over(torch.autograd.Function):
+    """`over` [h, w, 3] of the opacity [h, w] before an `image` and its opacity `alpha`, in their place and on the CPU:
+    over + (1 - opacity) * image, and the same of opacities. What little is drawn alone is touched: images are large."""
+
+    @staticmethod
+    def forward(ctx: Any, over: Tensor, opacity: Tensor, image: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        pixels = opacity.flatten().nonzero()[:, 0]
+        share, below, below_alpha = (_at(pixels, values) for values in (opacity, image, alpha))
+        clear = 1 - share
+        ctx.save_for_backward(pixels, clear, below, below_alpha)
+        image.view(-1, 3).index_copy_(0, pixels, _at(pixels, over) + clear[:, None] * below)
+        alpha.view(-1).index_copy_(0, pixels, share + clear * below_alpha)
+        ctx.mark_dirty(image, alpha)
+        return image, alpha
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_image: Tensor, by_alpha: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        pixels, clear, below, below_alpha = ctx.saved_tensors
+        here, here_alpha = _at(pixels, by_image), _at(pixels, by_alpha)
+        by_below, by_below_alpha = _unset(by_image).copy_(by_image), _unset(by_alpha).copy_(by_alpha)
+        by_below.view(-1, 3).index_copy_(0, pixels, clear[:, None] * here)
+        by_below_alpha.view(-1).index_copy_(0, pixels, clear * here_alpha)
+        # Where nothing is drawn there is nothing that this could move.
+        by_opacity = _unset(by_alpha).zero_()
+        changes = here_alpha - here_alpha * below_alpha - (here * below).sum(dim=1)
+        by_opacity.view(-1).index_copy_(0, pixels, changes)
+        return by_image, by_opacity, by_below, by_below_alpha
+
+
+def _at(pixels: Tensor, values: Tensor) -> Tensor:
+    """`values` [h, w, ...] at `pixels` (int64 [n], in the order of rows)."""
+    return values.flatten(0, 1).index_select(0, pixels)
 
 
 def _cut(image: Tensor, alpha: Tensor, background: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:

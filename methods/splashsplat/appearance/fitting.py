@@ -229,6 +229,7 @@ def fit_appearance(
     progress: Callable[[float], None],
     offer: Callable[[Callable[[], tuple[Appearance, np.ndarray]], bool], None] | None = None,
     settle: Callable[[], None] | None = None,
+    enlarge: Callable[[], None] | None = None,
     clock: Clock | None = None,
     device: str = CPU,
 ) -> Fit:
@@ -237,6 +238,7 @@ def fit_appearance(
     offer: is given, after every iteration once some photographs were seen, what makes the appearance as it is, but for
     heads that are means over the last steps, and the carriers still fitted: bool [count]; and whether there will be no
     other for a while. settle: is called once, after the share `plates_share`, to put the background behind `targets`.
+    enlarge: is called once, where targets have smaller ones and before they themselves teach, to put it behind them.
     clock: where given, the fit ends when it has run out, and `iterations` are the most that there are. device: where it
     is fitted; `targets` have their backgrounds there. What is given and handed out lies on the CPU.
 
@@ -359,6 +361,12 @@ def fit_appearance(
                 target = target.coarse
         return target
 
+    def leave_smaller_ones() -> None:
+        for target in targets:
+            target.coarse = None  # large, and not wanted any more
+        if enlarge is not None:
+            enlarge()
+
     reader = ReadAhead()
     begun = settings.begun / max(settings.iterations, 1)
     # What is transparent by what was handed on is left out at once; idle carriers are not looked for by that alone.
@@ -385,8 +393,7 @@ def fit_appearance(
         if factor is None:
             break
         if targets[0].coarse is not None and schedule.done(iteration) >= settings.coarse_share:
-            for target in targets:
-                target.coarse = None  # large, and not wanted any more
+            leave_smaller_ones()
         if not queue:
             queue = rng.permutation(_fitted(withheld_targets, schedule.withholds)).tolist()
         if settings.prune_opacity > 0 and prunings.come(iteration, schedule):
@@ -443,6 +450,8 @@ def fit_appearance(
         if offer is not None and iteration >= shown_from:
             offer(state, False)
     reader.close()
+    if targets[0].coarse is not None:
+        leave_smaller_ones()  # what is stored how coarsely is asked of the photographs themselves
     if glass is not None:
         glass.done()
     look.features = features.joined()

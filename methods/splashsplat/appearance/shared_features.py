@@ -31,7 +31,7 @@ _BLOCK = 1 << 16
 @dataclass(frozen=True)
 class _FeatureLevel:
     """Cells of one size. cells: int32 [count] of all carriers. table: [cells, width], what each cell adds. rows,
-    members: per frame the cells of its carriers, int64 and ascending, and which of these each carrier is in, int32."""
+    members: per frame the cells of its carriers, ascending, and which of these each carrier is in; int32."""
 
     cells: Tensor
     table: Tensor
@@ -121,7 +121,7 @@ class SharedFeatures:
         """Descend along the `gradient` [n, width] of what `of_frame` gave; `factor` scales the rates."""
         self._adam.step(chosen(self._ids[t], places), gradient, factor)
         for level in self._levels:
-            level.adam.step(level.rows[t], self._summed_by_cell(level, t, gradient, places), factor)
+            level.adam.step(level.rows[t].to(torch.int64), self._summed_by_cell(level, t, gradient, places), factor)
 
     def _summed_by_cell(self, level: _FeatureLevel, t: int, gradient: Tensor, places: Tensor | None) -> Tensor:
         rows, members = level.rows[t], level.members[t]
@@ -148,7 +148,7 @@ def _by_frame(cells: Tensor, ids: list[Tensor]) -> tuple[list[Tensor], list[Tens
 
 def _cells_and_members(cells: Tensor) -> tuple[Tensor, Tensor]:
     rows, members = torch.unique(cells, return_inverse=True)
-    return rows.to(torch.int64), members.to(torch.int32)
+    return rows.to(torch.int32), members.to(torch.int32)
 
 
 def births(carriers: Carriers) -> np.ndarray:

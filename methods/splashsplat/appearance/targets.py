@@ -9,7 +9,7 @@ target keeps the mask's bounding box and 8 pixels around it, at four bytes a pix
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -26,6 +26,9 @@ from ..carriers.subframe import Track, locate
 from ..kernel.window_loss import WindowPhotograph
 from .photographs import KEPT_BYTES, Deferred, Photograph, Shelf
 from .projection import projected_extent
+
+#: Name and background of training views, float32 [H, W, 3] or [3], one after the other, as they are large.
+Views = Iterable[tuple[str, np.ndarray]]
 
 SilhouetteNorm = Literal["image", "window", "mask"]
 
@@ -137,11 +140,20 @@ def _modes(camera: Camera, box: tuple[int, int, int, int]) -> np.ndarray:
     return tile_modes(read)
 
 
-def set_backgrounds(targets: list[TrainingTarget], backgrounds: Mapping[str, np.ndarray], device: str = CPU) -> None:
-    """Put others behind `targets`, in place, on `device`; backgrounds: as for `collect_targets`."""
-    images = {name: torch.from_numpy(image).to(device) for name, image in backgrounds.items()}
+def release_backgrounds(targets: list[TrainingTarget]) -> None:
+    """Let go of what is behind `targets`, in place, until others are put there."""
+    nothing = torch.zeros(3)
     for target in targets:
-        target.background = windowed(images[target.camera.name], target.corner, target.camera)
+        target.background = nothing
+
+
+def set_backgrounds(targets: list[TrainingTarget], views: Views, device: str = CPU) -> None:
+    """Put others behind `targets`, in place, on `device`."""
+    for name, image in views:
+        behind = torch.from_numpy(image).to(device)
+        for target in targets:
+            if target.camera.name == name:
+                target.background = windowed(behind, target.corner, target.camera)
 
 
 def windowed(image: Tensor, corner: tuple[int, int], camera: Camera) -> Tensor:

@@ -61,6 +61,11 @@ class LiquidOcclusion:
         """The same container, which leaves carriers out and cuts no pixels."""
         return LiquidOcclusion(self.mesh, self.tolerance)
 
+    def forget(self) -> None:
+        """Let go of what is known of cameras' images, which is large; it is made again where it is asked for."""
+        self._depths.clear()
+        self._walls.clear()
+
     def depth(self, camera: Camera) -> np.ndarray:
         """Depth of the container in `camera`'s image, float32 [H, W], inf where there is none."""
         # By identity, as arrays make no key; the camera is kept so that its number is not given to another.

@@ -11,8 +11,14 @@ from splashbench_methods.splashsplat.appearance.coarse import (
     set_smaller_backgrounds,
     with_smaller,
 )
-from splashbench_methods.splashsplat.appearance.photographs import Deferred, ReadAhead, Shelf, read_now
-from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
+from splashbench_methods.splashsplat.appearance.photographs import (
+    Deferred,
+    ReadAhead,
+    Shelf,
+    packed,
+    read_now,
+)
+from splashbench_methods.splashsplat.appearance.targets import TrainingTarget, release_backgrounds, set_backgrounds
 from splashbench_methods.splashsplat.kernel.window_loss import WindowPhotograph
 
 SIZE = 24
@@ -62,7 +68,7 @@ def test_a_point_is_seen_at_half_the_pixel() -> None:
 
 def test_pixels_are_means_of_four_and_a_mask_is_their_majority() -> None:
     coarse = halved(target())
-    photograph = coarse.photograph
+    photograph = read_now(coarse.photograph)
     assert (photograph.top, photograph.left) == (2, 2)
     assert photograph.image[0, :, 0].tolist() == [5, 25, 45, 65, 85]
     # Columns 5 to 9 are liquid: of the third pair, 4 and 5, half is.
@@ -79,7 +85,7 @@ def test_pixels_are_means_of_four_and_a_mask_is_their_majority() -> None:
 @pytest.mark.parametrize(("top", "left", "rows", "columns"), [(5, 4, 12, 10), (4, 5, 11, 9), (5, 5, 12, 11)])
 def test_a_box_at_an_odd_pixel_is_grown_to_even_ones(top: int, left: int, rows: int, columns: int) -> None:
     fine = target(top=top, left=left, rows=rows, columns=columns)
-    photograph = halved(fine).photograph
+    photograph = read_now(halved(fine).photograph)
     whole, mask = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
     whole[fine.photograph.box] = fine.photograph.image[..., 0].numpy()
     mask[fine.photograph.box] = fine.photograph.mask.numpy()
@@ -120,7 +126,7 @@ def test_windows_of_one_image_share_its_half() -> None:
     # Another background is halved in the same way.
     expected = [made.coarse.background.clone() for made in targets if made.coarse]
     with_smaller(targets, {"1": np.zeros_like(whole)}, {"1": wall})
-    set_smaller_backgrounds(targets, {"1": whole})
+    set_smaller_backgrounds(targets, [("1", whole)])
     for made, wanted in zip(targets, expected, strict=True):
         assert made.coarse is not None
         assert torch.equal(made.coarse.background, wanted)
@@ -177,7 +183,7 @@ def test_the_coarsest_are_the_coarse_ones_halved() -> None:
     block = made.background[4:8, 8:12].mean(dim=(0, 1))
     torch.testing.assert_close(coarsest.background[1, 2], block)
     behind = torch.rand(24, 24, 3)
-    set_smaller_backgrounds([made], {"1": behind.numpy()})
+    set_smaller_backgrounds([made], [("1", behind.numpy())])
     torch.testing.assert_close(coarsest.background[1, 2], behind[4:8, 8:12].mean(dim=(0, 1)))
     torch.testing.assert_close(coarse.background[1, 2], behind[2:4, 4:6].mean(dim=(0, 1)))
 
@@ -203,13 +209,52 @@ def test_a_coarse_pixel_is_the_rounded_mean_of_four() -> None:
 
 
 def test_coarse_photographs_beyond_the_room_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = halved(target()).photograph
+    read = []
+    monkeypatch.setattr(
+        coarse_module, "_read_halved", lambda photograph: read.append(1) or halved_photograph(photograph)
+    )
+    photograph = halved(target()).photograph
+    kept = read_now(photograph)
+    read_now(photograph)
+    assert len(read) == 1
     monkeypatch.setattr(coarse_module, "Shelf", lambda room=0: Shelf(room=0))
     later = halved(target()).photograph
-    assert isinstance(kept, WindowPhotograph)
-    assert isinstance(later, Deferred)
-    for _ in range(2):
+    for count in (2, 3):
         again = read_now(later)
+        assert len(read) == count
         assert torch.equal(again.image, kept.image)
         assert torch.equal(again.mask, kept.mask)
         assert (again.top, again.left) == (kept.top, kept.left)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (8, 8), (7, 16), (0, 4)])
+def test_a_mask_is_kept_in_bits(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    image = torch.from_numpy(rng.integers(0, 256, (*shape, 3), dtype=np.uint8))
+    made = WindowPhotograph(image, torch.from_numpy(rng.random(shape) < 0.5), top=3, left=6)
+    kept = packed(made)
+    made_again = kept.read()
+    assert made_again.image is image
+    assert torch.equal(made_again.mask, made.mask)
+    assert made_again.mask.dtype == torch.bool
+    assert made_again.mask.is_contiguous()
+    assert made_again.box == made.box
+    # Whoever changes what was read changes no later reading.
+    made_again.mask.logical_not_()
+    assert torch.equal(kept.read().mask, made.mask)
+
+
+def test_backgrounds_are_let_go_of_until_there_are_others() -> None:
+    made = target()
+    fine = made.background.numpy().copy()
+    coarse = halved(made)
+    assert coarse.coarse is not None
+    release_backgrounds([made])
+    assert made.background.numel() == 3
+    coarse.background, coarse.coarse.background = torch.zeros(3), torch.zeros(3)
+    set_smaller_backgrounds([made], iter([("2", fine), ("1", fine)]))
+    assert made.background.numel() == 3
+    assert tuple(coarse.background.shape) == (12, 12, 3)
+    assert tuple(coarse.coarse.background.shape) == (6, 6, 3)
+    set_backgrounds([made], iter([("2", np.zeros_like(fine)), ("1", fine)]))
+    np.testing.assert_array_equal(made.background.numpy(), fine)

@@ -19,7 +19,7 @@ from splashbench.observe.occlusion import ContainerOcclusion
 from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.scene import Scene, TrainingScene
-from splashbench_methods.splashsplat.appearance.compositing import composite
+from splashbench_methods.splashsplat.appearance.compositing import _Over, _Parts, composite
 from splashbench_methods.splashsplat.appearance.decoder import Children
 from splashbench_methods.splashsplat.fields import observations
 from splashbench_methods.splashsplat.fields.container import ContainerSource, KnownContainer
@@ -223,6 +223,44 @@ def test_liquid_is_cut_by_the_wall_except_before_it() -> None:
     assert bool((children.means.grad.abs().amax((1, 2)) > 0).all())
 
 
+@pytest.mark.parametrize("covered", [0.0, 0.02, 1.0])
+def test_what_is_drawn_over_an_image_is_blended_where_it_is_alone(covered: float) -> None:
+    rng = np.random.default_rng(7)
+    opacity = np.where(rng.random((30, 40)) < covered, rng.random((30, 40)), 0).astype(np.float32)
+    values = [opacity[..., None] * rng.random((30, 40, 3)), opacity, rng.random((30, 40, 3)), rng.random((30, 40))]
+    weights = [torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in ((30, 40, 3), (30, 40))]
+    outcomes = []
+    for compiled in (True, False):
+        leaves = [torch.from_numpy(value.astype(np.float32)).requires_grad_() for value in values]
+        over, share, image, alpha = (leaf * 1 for leaf in leaves)
+        if compiled:
+            found = _Over.apply(over, share, image, alpha)
+        else:
+            found = over + (1 - share[..., None]) * image, share + (1 - share) * alpha
+        gradients = torch.autograd.grad(sum((w * f).sum() for w, f in zip(weights, found)), leaves)
+        outcomes.append([*found, *gradients])
+    drawn = opacity > 0
+    for number, (mine, plain) in enumerate(zip(*outcomes)):
+        if number == 3:  # by opacity: where nothing is drawn there is no Gaussian that this could move
+            assert not mine.numpy()[~drawn].any()
+            mine, plain = mine[torch.from_numpy(drawn)], plain[torch.from_numpy(drawn)]
+        assert torch.equal(mine, plain)
+
+
+def test_rows_of_two_parts_get_their_gradients_back() -> None:
+    table, other = torch.rand(7, 3, 2, requires_grad=True), torch.rand(7, requires_grad=True)
+    first, last = torch.tensor([0, 2, 3, 6]), torch.tensor([1, 4, 5])
+    parts = _Parts.apply(first, last, table, other)
+    assert [tuple(part.shape) for part in parts] == [(4, 3, 2), (4,), (3, 3, 2), (3,)]
+    for part, rows, of in zip(parts, (first, first, last, last), (table, other) * 2):
+        assert torch.equal(part, of[rows])
+    weights = [torch.rand_like(part) for part in parts]
+    found = torch.autograd.grad(sum((w * part).sum() for w, part in zip(weights, parts)), [table, other])
+    for gradient, (of_first, of_last) in zip(found, ((weights[0], weights[2]), (weights[1], weights[3]))):
+        assert torch.equal(gradient[first], of_first)
+        assert torch.equal(gradient[last], of_last)
+
+
 def test_the_files_keep_the_edge(tmp_path: Path) -> None:
     occlusion = rim(bowl(0.003), PoolInABowl()).occlusion(TOLERANCE)
     occlusion.save(tmp_path)
@@ -245,3 +283,17 @@ def test_the_files_keep_the_edge(tmp_path: Path) -> None:
         np.savez(tmp_path / "container.npz", **changed)
         with pytest.raises(SplashbenchError, match=words):
             LiquidOcclusion.load(tmp_path)
+
+
+def test_what_is_known_of_an_image_is_found_again_once_it_was_forgotten() -> None:
+    occlusion, camera = rim(bowl(0.003), PoolInABowl()).occlusion(TOLERANCE), camera_at("a", 0.4)
+    points = np.random.default_rng(6).uniform(-0.4, 0.4, (500, 3))
+    before = occlusion.hidden(camera, points), occlusion.depth(camera), occlusion.wall(camera)
+    occlusion.forget()
+    after = occlusion.hidden(camera, points), occlusion.depth(camera), occlusion.wall(camera)
+    assert after[1] is not before[1]
+    assert before[2] is not None
+    assert after[2] is not None
+    np.testing.assert_array_equal(after[0], before[0])
+    np.testing.assert_array_equal(after[1], before[1])
+    np.testing.assert_array_equal(after[2].share, before[2].share)
