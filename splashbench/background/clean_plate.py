@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.background.median import masked_median
+from splashbench.parallel import each
 from splashbench.scene import Camera, TrainingScene
 from splashbench.scene.frames import spread_frames
 
@@ -21,8 +23,6 @@ from splashbench.scene.frames import spread_frames
 MAX_FRAMES = 32
 # Mask outlines are a few pixels off, and wet edges glisten beyond them: share of the image's longest side.
 _MARGIN = 0.006
-_ABSENT = 256
-_BAND_ROWS = 128
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,16 @@ def make_clean_plate(
     small = _shrunk_camera(camera, longest_side)
     images = np.empty((len(frames), small.height, small.width, 3), np.uint8)
     dry, nearly = (np.zeros(images.shape[:3], bool) for _ in range(2))
-    # Shrunk one by one: a 4K recording's frames do not fit into memory together.
-    for i, t in enumerate(frames):
-        image, mask = scene.image(name, t), scene.mask(name, t).astype(np.uint8)
+
+    def read(i: int) -> None:
+        # Shrunk one by one: a 4K recording's frames do not fit into memory together.
+        image, mask = scene.image(name, int(frames[i])), scene.mask(name, int(frames[i])).astype(np.uint8)
         plates = [shrunk(CleanPlate(camera, image, cv2.dilate(mask, disc) == 0), longest_side) for disc in discs]
         images[i], dry[i] = plates[0].image, plates[0].seen
         if near_still:
             images[i][~dry[i]], nearly[i] = plates[1].image[~dry[i]], plates[1].seen
+
+    each(read, range(len(frames)))
     beside = None
     if near_still:
         nearly &= ~dry.any(axis=0)
@@ -87,19 +90,6 @@ def make_clean_plates(scene: TrainingScene, n_frames: int = MAX_FRAMES) -> dict[
     """The plate of every training view of `scene`, in its size, of at most `n_frames` frames."""
     sizes = {name: max(camera.width, camera.height) for name, camera in scene.cameras.items()}
     return {name: make_clean_plate(scene, name, sizes[name], n_frames) for name in scene.train}
-
-
-def masked_median(images: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Lower median over the first axis of uint8 [T, H, W, 3] where bool [T, H, W] allows; 0 where it never does."""
-    median = np.zeros(images.shape[1:], np.uint8)
-    for top in range(0, images.shape[1], _BAND_ROWS):
-        rows = slice(top, top + _BAND_ROWS)
-        band = np.where(valid[:, rows, :, None], images[:, rows], np.uint16(_ABSENT))
-        band.sort(axis=0)
-        middle = np.maximum(valid[:, rows].sum(axis=0) - 1, 0) // 2
-        chosen = np.take_along_axis(band, middle[None, :, :, None], axis=0)[0]
-        median[rows] = np.where(chosen == _ABSENT, 0, chosen)
-    return median
 
 
 def _shrunk_camera(camera: Camera, longest_side: int) -> Camera:

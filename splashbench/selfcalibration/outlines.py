@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from splashbench.background.clean_plate import masked_median
+from splashbench.background.median import masked_median
 from splashbench.observe.silhouettes import outline_distance
+from splashbench.parallel import each
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
@@ -203,11 +204,14 @@ def sampled(scene: TrainingScene, name: str) -> Sample:
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     images = np.empty((len(chosen), size[1], size[0], 3), np.uint8)
     masks = np.empty(images.shape[:3], bool)
-    # Shrunk one by one: large photographs do not fit into memory together.
-    for i, t in enumerate(chosen):
-        image, mask = scene.image(name, t), scene.mask(name, t)
+
+    def read(i: int) -> None:
+        # Shrunk one by one: large photographs do not fit into memory together.
+        image, mask = scene.image(name, chosen[i]), scene.mask(name, chosen[i])
         images[i] = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         masks[i] = mask if scale == 1.0 else _resized(mask, size)
+
+    each(read, range(len(chosen)))
     return Sample(tuple(chosen), images, masks)
 
 

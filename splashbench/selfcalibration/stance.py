@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from splashbench.background.clean_plate import CleanPlate, masked_median
+from splashbench.background.clean_plate import CleanPlate
+from splashbench.background.median import masked_median
+from splashbench.parallel import each
 from splashbench.scene import Camera
 from splashbench.scene.scene import TrainingScene
 
@@ -67,7 +69,7 @@ def find_knock(scene: TrainingScene, name: str) -> Knock | None:
 def _plate(scene: TrainingScene, name: str, frames: range | list[int]) -> CleanPlate:
     disc = np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)
     dry = np.stack([cv2.dilate(scene.mask(name, t).astype(np.uint8), disc) == 0 for t in frames])
-    images = np.stack([scene.image(name, t) for t in frames])
+    images = np.stack(each(lambda t: scene.image(name, t), frames))
     return CleanPlate(scene.cameras[name], masked_median(images, dry), np.asarray(dry.any(axis=0)))
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from splashbench.background.clean_plate import CleanPlate, make_clean_plate, masked_median
+from splashbench.background.clean_plate import CleanPlate, make_clean_plate
 from splashbench.background.depth import common_target, depth_maps
+from splashbench.background.median import masked_median
 from splashbench.gaussians.anchor_seeds import AnchorSeed, seed_anchors, sparse_anchors
 from splashbench.gaussians.color_loss import l1
 from splashbench.gaussians.dynamic_model import rotation_matrices
@@ -48,6 +49,20 @@ class TestPlate:
         assert masked_median(images, dry).ravel().tolist() == [20, 20, 20]
         assert masked_median(images, np.zeros_like(dry)).ravel().tolist() == [0, 0, 0]
         assert masked_median(images, np.ones_like(dry)).ravel().tolist() == [30, 30, 30]
+
+    @pytest.mark.parametrize("frames", [0, 1, 2, 5, 32, 300])
+    @pytest.mark.parametrize("share", [0.0, 0.2, 0.9, 1.0])
+    def test_medians_are_those_of_sorted_values(self, frames, share):
+        rng = np.random.default_rng(frames)
+        images = rng.integers(0, 256, (frames, 7, 11, 3), dtype=np.uint8)
+        valid = rng.random((frames, 7, 11)) < share
+        expected = np.zeros((7, 11, 3), np.uint8)
+        for row, column in np.argwhere(valid.any(axis=0)):
+            chosen = np.sort(images[valid[:, row, column], row, column], axis=0)
+            expected[row, column] = chosen[(len(chosen) - 1) // 2]
+        np.testing.assert_array_equal(masked_median(images, valid), expected)
+        # Of a part of larger images, too.
+        np.testing.assert_array_equal(masked_median(images[:, 1:6, ::2], valid[:, 1:6, ::2]), expected[1:6, ::2])
 
     def test_a_passing_liquid_leaves_no_trace_and_a_lasting_one_no_evidence(self, passing_liquid):
         scene, background = passing_liquid
