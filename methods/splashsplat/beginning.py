@@ -19,7 +19,7 @@ from splashbench.render import Frozen
 from splashbench.scene.scene import TrainingScene
 
 from .appearance.coarse import HALVINGS, set_smaller_backgrounds, with_smaller
-from .appearance.first_look import Look, photographed, take_on
+from .appearance.first_look import FirstLook, Look, photographed, take_on
 from .appearance.fit_settings import FitSettings
 from .appearance.fitting import Appearance, initial_appearance, visible_carriers
 from .appearance.glass import glass_before
@@ -82,12 +82,14 @@ def begin(
         cuts = {
             name: None if occlusion is None else occlusion.cut(scene.cameras[name], nowhere) for name in scene.train
         }
-        with_smaller(targets, backgrounds, {name: None if cut is None else cut[0] for name, cut in cuts.items()})
+        # To read large photographs once more for it would take longer than to look at them.
+        first = FirstLook(traced.track) if targets and config.first_look else None
+        walls = {name: None if cut is None else cut[0] for name, cut in cuts.items()}
+        with_smaller(targets, backgrounds, walls, first)
+        look = None if first is None else first.look()
+    else:
+        look = photographed(traced.track, targets) if targets and config.first_look else None
     memory.give_back()
-    look = None
-    if targets and config.first_look:
-        # Half-size photographs say as much, and are there already.
-        look = photographed(traced.track, [target.coarse or target for target in targets])
     if occlusion is not None:
         occlusion.forget()
     memory.give_back()

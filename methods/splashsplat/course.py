@@ -121,8 +121,9 @@ class Course:
             return
         with run.stage("self-calibration"):
             found = self_calibration(self._scene, self._plates, lambda what: run.progress(0, what))
+        if lines := found.lines(self._scene.cameras):
+            run.note("self-calibration", "; ".join(lines))
         if found:
-            run.note("self-calibration", "; ".join(found.lines(self._scene.cameras)))
             self._scene, self._known, self._transmittance = found.scene(self._scene), None, None
             self._plates = _plates_of(self._scene)
 

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -49,6 +50,9 @@ SURE = 2.0
 _DEEP, _DEEPEST, _DEEP_LATER, _FAR, _FAR_LATER = 2.0, 0.75, 1.5, (4.0, 0.02), (2.5, 0.0125)
 # Evidence is smoothed by so much of the longer side, and by so many pixels at least.
 _BLUR, _LEAST_BLUR = 0.002, 0.6
+# Photographs with more noise than this, in levels of 255, have no say: in the dark parts of what they show is next to
+# nothing else, and right masks look wrong. And the median of a normal variable's size, by its standard deviation.
+_NOISY, _MEDIAN_OF_NORMAL = 14.0, 0.6745
 # Outlines as near as this to each other are the same, in pixels of an image of 240.
 _SAME = 1.25
 # The masks of a camera are replaced where the middle one is wrong by more than the first share of its area, or by more
@@ -166,18 +170,23 @@ class Answer:
 
 @dataclass(frozen=True)
 class Examined:
-    """Of some cameras: outlines of those whose masks are not what the photographs show, and the names of those whose
-    masks seem wrong, while what photographs say instead is not to be trusted."""
+    """Of some cameras: outlines of those whose masks are not what the photographs show, the names of those whose masks
+    seem wrong, while what photographs say instead is not to be trusted, and the noise in levels of those whose
+    photographs are too noisy to be asked."""
 
     outlines: Mapping[str, Outlines]
     untrusted: tuple[str, ...]
+    noisy: Mapping[str, float] = field(default_factory=dict)
 
 
 def examined(scene: TrainingScene, names: Sequence[str]) -> Examined:
     """The masks of the training cameras `names` of `scene`, held against its photographs."""
-    samples = {name: sampled(scene, name) for name in names}
+    every = {name: sampled(scene, name) for name in names}
+    noise = {name: noise_of(sample.images) for name, sample in every.items()}
+    noisy = {name: levels for name, levels in noise.items() if levels > _NOISY}
+    samples = {name: sample for name, sample in every.items() if name not in noisy}
     if not samples:
-        return Examined({}, ())
+        return Examined({}, (), noisy)
     wrong = {}
     for name, sample in samples.items():
         shown = asked(sample, sample.masks, _ROUNDS).masks
@@ -193,7 +202,18 @@ def examined(scene: TrainingScene, names: Sequence[str]) -> Examined:
                 found |= {name: replaced} if replaced else {}
             else:
                 untrusted.append(name)
-    return Examined(found, tuple(untrusted))
+    return Examined(found, tuple(untrusted), noisy)
+
+
+def noise_of(images: Images) -> float:
+    """The noise of `images` [F, h, w, 3] of one camera, in levels (standard deviation): by how much what changes from
+    one to the next differs between neighbours at most pixels. Light that changes does so for both. One image has none.
+    """
+    if len(images) < 2:
+        return 0.0
+    changes = (one.astype(np.int16) - other for one, other in pairwise(images))
+    middles = [float(np.median(np.abs(np.diff(change, axis=1)))) for change in changes]
+    return float(np.median(middles)) / (2 * _MEDIAN_OF_NORMAL)
 
 
 def sampled(scene: TrainingScene, name: str) -> Sample:

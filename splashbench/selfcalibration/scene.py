@@ -35,7 +35,7 @@ class SelfCalibration:
 
     offsets: of clocks. seconds_per_step: of a timestep. knocks: cameras that moved. cameras: as fitted, or None where
     they are right. responses: of cameras that see light otherwise than most. outlines: of cameras whose masks are not
-    what their photographs show.
+    what their photographs show. noisy: levels of noise of those that were not asked for that; nothing that is other.
     """
 
     offsets: Mapping[str, Offset] = field(default_factory=dict)
@@ -44,6 +44,7 @@ class SelfCalibration:
     cameras: FittedCameras | None = None
     responses: Mapping[str, Response] = field(default_factory=dict)
     outlines: Mapping[str, Outlines] = field(default_factory=dict)
+    noisy: Mapping[str, float] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return bool(self.offsets or self.knocks or self.cameras or self.responses or self.outlines)
@@ -71,6 +72,10 @@ class SelfCalibration:
             found.append(f"camera {name} sees light otherwise than most: {', '.join(told_of)}")
         for name, outline in self.outlines.items():
             found.append(f"camera {name}: {outline.line}")
+        for name, levels in self.noisy.items():
+            found.append(
+                f"camera {name}: photographs have {levels:.0f} levels of noise, too much to hold masks against them"
+            )
         return found
 
     def scene(self, scene: TrainingScene) -> TrainingScene:
@@ -229,9 +234,9 @@ def self_calibration(
     held = examined(right, sharp)
     if 2 * len({*by_change, *held.outlines, *held.untrusted}) >= len(scene.train):
         # Of masks that show but the core of the liquid it is not told by these what they lack.
-        left = [name for name in sharp if name not in held.outlines]
+        left = [name for name in sharp if name not in {*held.outlines, *held.noisy}]
         by_change = {**by_change, **outlines_by_change(right, left)}
-    found = replace(found, outlines={**by_change, **held.outlines})
+    found = replace(found, outlines={**by_change, **held.outlines}, noisy=held.noisy)
     told("comparing clocks")
     right = found.scene(scene)
     own_times = any(not np.array_equal(times, scene.times) for times in scene.camera_times.values())

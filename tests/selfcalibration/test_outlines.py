@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splashbench.scene import Camera
-from splashbench.selfcalibration.outlines import Outlines, PackedMasks, examined
+from splashbench.selfcalibration.outlines import Outlines, PackedMasks, examined, noise_of
 
 from .conftest import NAMES, photograph
 
@@ -48,8 +48,10 @@ def footage(
     masks: Masks = lambda name, t, mask: mask,
     liquid: Callable[[str, int], NDArray[np.bool_]] = splash,
     blur: float = 0.0,
+    noise: float = 2.0,
 ) -> Any:
-    """A scene of five cameras that see `liquid`, told `masks` of its true ones. blur: of photographs, in pixels."""
+    """A scene of five cameras that see `liquid`, told `masks` of its true ones. blur: of photographs, in pixels. noise:
+    of theirs, in levels."""
     still = {name: photograph(camera).astype(float) for name, camera in cameras.items()}
 
     def image(name: str, t: int) -> NDArray[np.uint8]:
@@ -57,7 +59,7 @@ def footage(
         # Edges are mixed, and every pixel is noisy.
         share = cv2.GaussianBlur(liquid(name, t).astype(float), (0, 0), 0.6)[..., None]
         color = LIQUID + 6 * rng.normal(size=(160, 240, 1))
-        seen = still[name] + share * (color - still[name]) + 2 * rng.normal(size=(160, 240, 3))
+        seen = still[name] + share * (color - still[name]) + noise * rng.normal(size=(160, 240, 3))
         seen = cv2.GaussianBlur(seen, (0, 0), blur) if blur else seen
         return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
 
@@ -100,6 +102,33 @@ def agreement(scene: Any, found: Mapping[str, Outlines]) -> tuple[float, float]:
 
 def test_right_masks_stay(cameras: dict[str, Camera]) -> None:
     assert examined(footage(cameras), NAMES).outlines == {}
+
+
+@pytest.mark.parametrize("told", [lambda name, t, mask: mask, grown], ids=["right", "grown"])
+@pytest.mark.parametrize("noise", [20, 40])
+def test_noisy_photographs_have_no_say(cameras: dict[str, Camera], told: Masks, noise: float) -> None:
+    found = examined(footage(cameras, told, noise=noise), NAMES)
+    assert (found.outlines, found.untrusted) == ({}, ())
+    assert found.noisy == {name: pytest.approx(noise, rel=0.1) for name in NAMES}
+
+
+def test_one_noisy_camera_leaves_the_others_their_say(cameras: dict[str, Camera]) -> None:
+    quiet, loud = (footage(cameras, grown, noise=noise) for noise in (2, 30))
+    quiet.image = (lambda of_all: lambda name, t: (loud.image if name == "2" else of_all)(name, t))(quiet.image)
+    found = examined(quiet, NAMES)
+    assert found.outlines.keys() == set(NAMES) - {"2"}
+    assert found.noisy.keys() == {"2"}
+
+
+@pytest.mark.parametrize("noise", [0, 3, 15, 40])
+def test_noise_is_measured_and_what_else_changes_is_not(noise: float) -> None:
+    rng = np.random.default_rng(8)
+    scene = np.kron(rng.integers(60, 180, (15, 20, 3)), np.ones((8, 8, 1)))
+    frames = [scene + light + rng.normal(scale=max(noise, 1e-9), size=scene.shape) for light in (0, 25, -20, 10)]
+    frames[2][:60, :90] += 50  # something large passes
+    images = np.clip(np.rint(np.stack(frames)), 0, 255).astype(np.uint8)
+    assert noise_of(images) == pytest.approx(noise, rel=0.1, abs=0.5)
+    assert noise_of(images[:1]) == 0
 
 
 @pytest.mark.parametrize(("masks", "beyond"), [(eroded, -2), (grown, 4)], ids=["eroded", "grown"])

@@ -255,6 +255,12 @@ def test_the_command_tells_what_it_finds_in_json(
     assert main(["scene", "self-calibrate", str(wrong_directory), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["cameras"]["corrections"]["1"]["turned"] == pytest.approx(0.5)
+    noisy = SelfCalibration(noisy={"2": 31.0})
+    monkeypatch.setattr("splashbench.selfcalibration.self_calibration", lambda scene, told: noisy)
+    assert main(["scene", "self-calibrate", str(wrong_directory), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["noise"] == {"2": 31.0}
+    assert facts["lines"] == ["camera 2: photographs have 31 levels of noise, too much to hold masks against them"]
 
 
 def test_a_right_scene_is_said_to_be_and_still_copied(

@@ -10,6 +10,7 @@ import pytest
 from splashbench import toml
 from splashbench.harness.contract import Run
 from splashbench.scene import Camera, Scene, SceneMeta, TrainingScene, write_scene
+from splashbench.selfcalibration import SelfCalibration
 from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course  # type: ignore[import-not-found]
 
 from .conftest import NAMES, arc_camera, discs, light, photograph
@@ -57,6 +58,14 @@ def test_the_preset_quick_goes_by_it_and_notes_it(lit: Scene, monkeypatch: pytes
     assert "self-calibration" in run.stages
     assert scene.variation
     assert scene.image("2", 0).mean() == pytest.approx(light(lit.image("2", 0), -0.5).mean(), abs=1)
+
+
+def test_noise_is_noted_and_changes_nothing(lit: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(course, "self_calibration", lambda *others: SelfCalibration(noisy={"3": 22.4}))
+    scene, run = traced(lit, "quick", monkeypatch)
+    told = "camera 3: photographs have 22 levels of noise, too much to hold masks against them"
+    assert run.notes == {"self-calibration": told}
+    assert scene.variation == ""
 
 
 def test_the_preset_paper_goes_by_what_it_is_told(lit: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

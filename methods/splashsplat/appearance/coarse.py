@@ -18,46 +18,67 @@ from splashbench.gaussians.devices import CPU
 from splashbench.parallel import each
 
 from ..kernel.window_loss import WindowPhotograph
+from .first_look import FirstLook
 from .photographs import Deferred, Photograph, Shelf, packed, read_now
 from .targets import TrainingTarget, Views, windowed
 
 #: How often photographs are halved. Windows begin at pixels that this leaves whole.
 HALVINGS = 2
+# Photographs that are read before what was seen in them is added up.
+_AT_ONCE = 16
 
 
 def with_smaller(
     targets: list[TrainingTarget],
     backgrounds: Mapping[str, np.ndarray],
     walls: Mapping[str, np.ndarray | None],
+    first: FirstLook | None = None,
 ) -> None:
     """Give each target its `coarse` one of half the size, and that one its own, in place.
 
     backgrounds: float32 [H, W, 3] or [3] by view; walls: float32 [H, W] or None by view; of whole images, which the
     targets' windows are parts of. They are halved once each, and shared. Of photographs the larger ones are kept, as
-    far as there is room; smaller ones are made of these whenever they are to teach.
+    far as there is room; smaller ones are made of these whenever they are to teach. first: has a look at the large ones
+    as they are read for that, where given.
     """
     behind = {name: torch.from_numpy(image) for name, image in backgrounds.items()}
     before = {name: None if wall is None else torch.from_numpy(wall) for name, wall in walls.items()}
     for number in range(HALVINGS):
         behind = {name: _halved(image) for name, image in behind.items()}
         before = {name: None if wall is None else _halved(wall) for name, wall in before.items()}
-        _halve(targets, behind, before, Shelf() if number == 0 else Shelf(0))
+        if number == 0:
+            _halve(targets, behind, before, Shelf(), first)
+        else:
+            _halve(targets, behind, before, Shelf(0), None)
         targets = [target.coarse for target in targets if target.coarse is not None]
 
 
 def _halve(
-    targets: list[TrainingTarget], behind: Mapping[str, Tensor], before: Mapping[str, Tensor | None], shelf: Shelf
+    targets: list[TrainingTarget],
+    behind: Mapping[str, Tensor],
+    before: Mapping[str, Tensor | None],
+    shelf: Shelf,
+    first: FirstLook | None,
 ) -> None:
-    """Give each target its `coarse` one, in place. behind, before: of whole images of its size."""
+    """Give each target its `coarse` one, in place. behind, before: of whole images of its size. first: see
+    `with_smaller`."""
 
-    def halve(target: TrainingTarget) -> None:
-        later = Deferred(partial(_read_halved, target.photograph))
-        photograph = later if shelf.full else packed(shelf.keep(later.read()))
+    def halve(target: TrainingTarget) -> tuple[np.ndarray, np.ndarray] | None:
+        photograph: Photograph = Deferred(partial(_read_halved, target.photograph))
+        seen = None
+        if first is not None or not shelf.full:
+            large = read_now(target.photograph)
+            seen = None if first is None else first.at(target, large)
+            photograph = photograph if shelf.full else packed(shelf.keep(halved_photograph(large)))
         name = target.camera.name
         target.coarse = half_size(target, photograph, behind[name], before[name])
+        return seen
 
-    # Most of the time goes into reading photographs.
-    each(halve, targets)
+    # Most of the time goes into reading photographs. What is seen in them is added up in their order, a few at a time.
+    for start in range(0, len(targets), _AT_ONCE):
+        for seen in each(halve, targets[start : start + _AT_ONCE]):
+            if first is not None and seen is not None:
+                first.add(seen)
 
 
 def set_smaller_backgrounds(targets: list[TrainingTarget], views: Views, device: str = CPU) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ..carriers.subframe import Track
+from ..kernel.window_loss import WindowPhotograph
 from .decoder import Decoder
 from .photographs import ReadAhead
 from .projection import project
@@ -55,9 +56,8 @@ class Look:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add(
+def _shown(
     positions: np.ndarray,
-    ids: np.ndarray,
     seen: np.ndarray,
     projection: np.ndarray,
     corner: tuple[int, int],
@@ -65,10 +65,9 @@ def _add(
     image: np.ndarray,
     reach: float,
     nearest: np.ndarray,
-    sums: np.ndarray,
-) -> None:
-    """Adds weight, weighted colours and their weighted squares to sums [count, 7], of carriers within a photograph's
-    mask; nearest: float64 of the mask's shape, inf. No carrier is in a frame twice."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """The carriers within a photograph's mask, int64 [n], and of each its weight, weighted colour and weighted squares,
+    float64 [n, 7]; nearest: float64 of the mask's shape, inf."""
     height, width = mask.shape
     rows, columns = np.full(len(positions), -1, np.int64), np.empty(len(positions), np.int64)
     depths = np.empty(len(positions))
@@ -80,58 +79,78 @@ def _add(
         if depth > 0 and 0 <= column < width and 0 <= row < height and mask[int(row), int(column)]:
             rows[n], columns[n], depths[n] = int(row), int(column), depth
             nearest[rows[n], columns[n]] = min(nearest[rows[n], columns[n]], depth)
-    for n in range(len(positions)):
-        row, column = rows[n], columns[n]
-        if row < 0:
-            continue
-        weight = 1.0 if depths[n] <= nearest[row, column] + reach else _BEHIND
-        total = sums[ids[n]]
-        total[0] += weight
+    within = np.flatnonzero(rows >= 0)
+    shown = np.empty((len(within), 7))
+    for k in range(len(within)):
+        carrier = within[k]
+        row, column = rows[carrier], columns[carrier]
+        weight = 1.0 if depths[carrier] <= nearest[row, column] + reach else _BEHIND
+        shown[k, 0] = weight
         for channel in range(3):
             color = image[row, column, channel] / 255
-            total[1 + channel] += weight * color
-            total[4 + channel] += weight * color**2
+            shown[k, 1 + channel] = weight * color
+            shown[k, 4 + channel] = weight * color**2
+    return within, shown
+
+
+class FirstLook:
+    """Adds up how photographs show the carriers of `track`, one photograph after the other.
+
+    A photograph sees a carrier where no other lies before it; of what lies behind it says little.
+    """
+
+    def __init__(self, track: Track) -> None:
+        self._track = track
+        self._sums = np.zeros((track.carriers.count, 7))
+
+    def at(self, target: TrainingTarget, photograph: WindowPhotograph) -> tuple[np.ndarray, np.ndarray]:
+        """What the `photograph` of `target` shows, to be added; several may be looked at at once."""
+        mask = photograph.mask.numpy()
+        within, shown = _shown(
+            self._track.positions(target.frame, target.fraction),
+            _EVERY if target.hidden is None else target.hidden.numpy() < HIDDEN // 2,
+            np.ascontiguousarray(target.camera.projection),
+            (photograph.left, photograph.top),
+            np.ascontiguousarray(mask),
+            np.ascontiguousarray(photograph.image.numpy()),
+            _SEEN_WITHIN * self._track.grid.voxel,
+            np.full(mask.shape, np.inf),
+        )
+        carriers = self._track.carriers
+        return carriers.ids[carriers.rows(target.frame)][within], shown
+
+    def add(self, seen: tuple[np.ndarray, np.ndarray]) -> None:
+        """Add what `at` found. No carrier is in a frame twice."""
+        ids, shown = seen
+        self._sums[ids] += shown
+
+    def look(self) -> Look:
+        """How all of them show each carrier. Carriers in none have the mean colour of the others."""
+        sums = self._sums
+        seen_at_all = sums[:, 0].any()
+        mean = sums[:, 1:4].sum(axis=0) / sums[:, 0].sum() if seen_at_all else np.full(3, 0.5)
+        look = Look(np.empty((len(sums), 3), np.float32), np.empty(len(sums), np.float32))
+        for start in range(0, len(sums), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            look.colors[rows], look.spread[rows] = _mean_and_spread(sums[rows], mean)
+        return look
 
 
 def photographed(track: Track, targets: Sequence[TrainingTarget]) -> Look:
-    """How the photographs of `targets` show each carrier.
-
-    A photograph sees a carrier where no other lies before it; of what lies behind it says little. Carriers in no
-    photograph have the mean colour of the others.
-    """
-    sums = np.zeros((track.carriers.count, 7))
-    reach = _SEEN_WITHIN * track.grid.voxel
+    """How the photographs of `targets` show each carrier; see `FirstLook`."""
+    first = FirstLook(track)
     reader = ReadAhead()
     for target, following in zip(targets, [*targets[1:], None]):
         photograph = reader.get(target.photograph)
         if following is not None:
             reader.prepare(following.photograph)
-        mask = photograph.mask.numpy()
-        seen = _EVERY if target.hidden is None else target.hidden.numpy() < HIDDEN // 2
-        _add(
-            track.positions(target.frame, target.fraction),
-            track.carriers.ids[track.carriers.rows(target.frame)],
-            seen,
-            np.ascontiguousarray(target.camera.projection),
-            (photograph.left, photograph.top),
-            np.ascontiguousarray(mask),
-            np.ascontiguousarray(photograph.image.numpy()),
-            reach,
-            np.full(mask.shape, np.inf),
-            sums,
-        )
+        first.add(first.at(target, photograph))
     reader.close()
-    seen_at_all = sums[:, 0].any()
-    mean = sums[:, 1:4].sum(axis=0) / sums[:, 0].sum() if seen_at_all else np.full(3, 0.5)
-    look = Look(np.empty((len(sums), 3), np.float32), np.empty(len(sums), np.float32))
-    for start in range(0, len(sums), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        look.colors[rows], look.spread[rows] = _mean_and_spread(sums[rows], mean)
-    return look
+    return first.look()
 
 
 def _mean_and_spread(sums: np.ndarray, otherwise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours [n, 3] and spread [n] of `sums` [n, 7] of `_add`; `otherwise` [3], and none, where nothing was added."""
+    """Colours [n, 3] and spread [n] of sums [n, 7] of `FirstLook`; `otherwise` [3], and none, where there are none."""
     weights = sums[:, 0]
     known, total = weights > 0, np.maximum(weights, 1e-9)[:, None]
     colors = np.where(known[:, None], sums[:, 1:4] / total, otherwise)

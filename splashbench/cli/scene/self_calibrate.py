@@ -112,4 +112,5 @@ def _facts(scene: Scene, found: SelfCalibration) -> dict[str, Any]:
             name: {"timesteps": sorted(outline.masks.bits), "reach_beyond_px": outline.beyond}
             for name, outline in found.outlines.items()
         },
+        "noise": dict(found.noisy),
     }

@@ -1,5 +1,7 @@
 """Training targets at half their size: the same view of the same liquid, with pixels twice as large."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -209,22 +211,52 @@ def test_a_coarse_pixel_is_the_rounded_mean_of_four() -> None:
 
 
 def test_coarse_photographs_beyond_the_room_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    read = []
-    monkeypatch.setattr(
-        coarse_module, "_read_halved", lambda photograph: read.append(1) or halved_photograph(photograph)
-    )
+    made = []
+
+    def counted(photograph: WindowPhotograph) -> WindowPhotograph:
+        made.append(photograph)
+        return halved_photograph(photograph)
+
+    monkeypatch.setattr(coarse_module, "halved_photograph", counted)
     photograph = halved(target()).photograph
     kept = read_now(photograph)
     read_now(photograph)
-    assert len(read) == 1
+    assert len(made) == 1
     monkeypatch.setattr(coarse_module, "Shelf", lambda room=0: Shelf(room=0))
     later = halved(target()).photograph
+    assert len(made) == 1
     for count in (2, 3):
         again = read_now(later)
-        assert len(read) == count
+        assert len(made) == count
         assert torch.equal(again.image, kept.image)
         assert torch.equal(again.mask, kept.mask)
         assert (again.top, again.left) == (kept.top, kept.left)
+
+
+@pytest.mark.parametrize("room", [0, 1 << 20])
+def test_large_photographs_are_looked_at_once_and_in_their_order(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(coarse_module, "Shelf", lambda most=room: Shelf(most))
+    monkeypatch.setattr(coarse_module, "_AT_ONCE", 3)
+    targets, read = [target() for _ in range(8)], []
+    for number, each in enumerate(targets):
+        photograph = read_now(each.photograph)
+        each.photograph = Deferred(lambda photograph=photograph, number=number: read.append(number) or photograph)
+
+    class Look:
+        def __init__(self) -> None:
+            self.added: list[int] = []
+
+        def at(self, seen: TrainingTarget, photograph: WindowPhotograph) -> int:
+            assert photograph.mask.shape == (12, 10)
+            return next(number for number, each in enumerate(targets) if each is seen)
+
+        def add(self, seen: int) -> None:
+            self.added.append(seen)
+
+    look: Any = Look()
+    with_smaller(targets, {"1": targets[0].background.numpy()}, {"1": None}, look)
+    assert look.added == list(range(8))
+    assert sorted(read) == list(range(8))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (8, 8), (7, 16), (0, 4)])
