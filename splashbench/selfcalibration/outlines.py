@@ -16,7 +16,6 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -51,8 +50,9 @@ _DEEP, _DEEPEST, _DEEP_LATER, _FAR, _FAR_LATER = 2.0, 0.75, 1.5, (4.0, 0.02), (2
 # Evidence is smoothed by so much of the longer side, and by so many pixels at least.
 _BLUR, _LEAST_BLUR = 0.002, 0.6
 # Photographs with more noise than this, in levels of 255, have no say: in the dark parts of what they show is next to
-# nothing else, and right masks look wrong. And the median of a normal variable's size, by its standard deviation.
-_NOISY, _MEDIAN_OF_NORMAL = 14.0, 0.6745
+# nothing else, and right masks look wrong. The share of the image that has to be beside the liquid to tell; and the
+# median of a normal variable's size, by its standard deviation.
+_NOISY, _LEAST_BESIDE, _MEDIAN_OF_NORMAL = 14.0, 0.02, 0.6745
 # Outlines as near as this to each other are the same, in pixels of an image of 240.
 _SAME = 1.25
 # The masks of a camera are replaced where the middle one is wrong by more than the first share of its area, or by more
@@ -182,7 +182,7 @@ class Examined:
 def examined(scene: TrainingScene, names: Sequence[str]) -> Examined:
     """The masks of the training cameras `names` of `scene`, held against its photographs."""
     every = {name: sampled(scene, name) for name in names}
-    noise = {name: noise_of(sample.images) for name, sample in every.items()}
+    noise = {name: noise_of(sample) for name, sample in every.items()}
     noisy = {name: levels for name, levels in noise.items() if levels > _NOISY}
     samples = {name: sample for name, sample in every.items() if name not in noisy}
     if not samples:
@@ -205,15 +205,18 @@ def examined(scene: TrainingScene, names: Sequence[str]) -> Examined:
     return Examined(found, tuple(untrusted), noisy)
 
 
-def noise_of(images: Images) -> float:
-    """The noise of `images` [F, h, w, 3] of one camera, in levels (standard deviation): by how much what changes from
-    one to the next differs between neighbours at most pixels. Light that changes does so for both. One image has none.
-    """
-    if len(images) < 2:
-        return 0.0
-    changes = (one.astype(np.int16) - other for one, other in pairwise(images))
-    middles = [float(np.median(np.abs(np.diff(change, axis=1)))) for change in changes]
-    return float(np.median(middles)) / (2 * _MEDIAN_OF_NORMAL)
+def noise_of(sample: Sample) -> float:
+    """The noise of the photographs of `sample` in levels (standard deviation): by how much what changes from one to the
+    next differs between neighbours, at most pixels beside the liquid, which changes itself. Light that changes does so
+    for both. 0 where there is nothing to tell it by: one image, or liquid nearly everywhere."""
+    middles = []
+    for t in range(len(sample.images) - 1):
+        change = sample.images[t + 1].astype(np.int16) - sample.images[t]
+        beside = ~(sample.masks[t + 1] | sample.masks[t])
+        differences = np.diff(change, axis=1)[beside[:, 1:] & beside[:, :-1]]
+        if len(differences) >= _LEAST_BESIDE * beside.size:
+            middles.append(float(np.median(np.abs(differences))))
+    return float(np.median(middles)) / (2 * _MEDIAN_OF_NORMAL) if middles else 0.0
 
 
 def sampled(scene: TrainingScene, name: str) -> Sample:

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splashbench.scene import Camera
-from splashbench.selfcalibration.outlines import Outlines, PackedMasks, examined, noise_of
+from splashbench.selfcalibration.outlines import Outlines, PackedMasks, Sample, examined, noise_of
 
 from .conftest import NAMES, photograph
 
@@ -127,8 +127,16 @@ def test_noise_is_measured_and_what_else_changes_is_not(noise: float) -> None:
     frames = [scene + light + rng.normal(scale=max(noise, 1e-9), size=scene.shape) for light in (0, 25, -20, 10)]
     frames[2][:60, :90] += 50  # something large passes
     images = np.clip(np.rint(np.stack(frames)), 0, 255).astype(np.uint8)
-    assert noise_of(images) == pytest.approx(noise, rel=0.1, abs=0.5)
-    assert noise_of(images[:1]) == 0
+    nowhere = np.zeros(images.shape[:3], bool)
+    assert noise_of(Sample((0, 1, 2, 3), images, nowhere)) == pytest.approx(noise, rel=0.1, abs=0.5)
+    assert noise_of(Sample((0,), images[:1], nowhere[:1])) == 0
+    assert noise_of(Sample((0, 1), images[:2, :, :1], nowhere[:2, :, :1])) == 0
+    # Liquid that fills most of the picture is no noise, whatever it does there.
+    filled = nowhere.copy()
+    filled[:, 10:] = True
+    images[filled] = rng.integers(0, 256, images[filled].shape)
+    assert noise_of(Sample((0, 1, 2, 3), images, filled)) == pytest.approx(noise, rel=0.15, abs=0.5)
+    assert noise_of(Sample((0, 1, 2, 3), images, ~nowhere)) == 0
 
 
 @pytest.mark.parametrize(("masks", "beyond"), [(eroded, -2), (grown, 4)], ids=["eroded", "grown"])

@@ -84,7 +84,10 @@ def _halve(
 def set_smaller_backgrounds(targets: list[TrainingTarget], views: Views, device: str = CPU) -> None:
     """Put others behind the smaller ones of `targets` where these have some, in place, on `device`."""
     for name, image in views:
-        behind, smaller = torch.from_numpy(image).to(device), [each for each in targets if each.camera.name == name]
+        behind, smaller = (
+            torch.from_numpy(image).to(device),
+            [target for target in targets if target.camera.name == name],
+        )
         while smaller := [target.coarse for target in smaller if target.coarse is not None]:
             behind = _halved(behind)
             for target in smaller:
