@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 #: What lies behind the liquid in each training view, float32 [H, W, 3].
 Backgrounds = dict[str, np.ndarray]
 
-# Liquid is transparent from this share of the background on that shows through it: .6 in clear water, .2 to .4 in dyed
-# water in a tank, none in paint.
-_TRANSPARENT = 0.5
+# Share of the background that shows through the liquid from which on it comes before coarse grids, and that from which
+# on Gaussians show it: it is .6 in clear water, .2 to .4 in dyed water in a tank, and .03 at the most in paint.
+_TRANSPARENT, _TRANSMITS = 0.5, 0.1
 # Shares of the time that a background takes that comes first, the fit on coarse grids, and everything else before the
 # fine appearance, for the progress bar only.
 _BACKGROUND, _COARSE, _BEFORE = 0.15, 0.2, 0.35
@@ -111,8 +111,8 @@ class Course:
         run.progress(0, "draft")
         with run.stage("draft"):
             shows_through = self._shows_through() if scene is self._scene else transmittance(scene, plates())
-            opaque = shows_through < _TRANSPARENT
-            return make_draft(scene, self._config, run.aside(), known, plates, opaque, show)
+            opaque, config = shows_through < _TRANSPARENT, _transmission_settled(self._config, shows_through)
+            return make_draft(scene, config, run.aside(), known, plates, opaque, show)
 
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
@@ -159,6 +159,25 @@ class Course:
             self._transmittance = transmittance(self._scene, self._plates())
         return self._transmittance
 
+    def _settle_transmission(self) -> None:
+        """Whether Gaussians show what is behind them, from now on."""
+        if self._config.transmission != "measured":
+            return
+        if self._config.composition == "together":
+            self._config = _transmission_settled(self._config, 0.0)
+            return
+        share = self._shows_through()
+        self._config = _transmission_settled(self._config, share)
+        self._run.decide(
+            Decision(
+                name="transmission",
+                basis="scene",
+                chosen="Gaussians show what is behind them" if share >= _TRANSMITS else "none",
+                because=f"{100 * share:.0f} % of the texture behind the liquid shows through it; from "
+                f"{100 * _TRANSMITS:.0f} % on each Gaussian has a share of it",
+            )
+        )
+
     def _stand_in(self) -> Backgrounds:
         """What lies behind the liquid of every training view before the background is fitted."""
         from ..scaffold_gs import completed, flat_background
@@ -199,6 +218,7 @@ class Course:
     def _from_coarse_grids(self) -> State:
         """With coarse grids first."""
         run, behind = self._run, self._stand_in()
+        self._settle_transmission()
         share = self._shows_through()
         transparent = share >= _TRANSPARENT
         run.decide(
@@ -291,6 +311,7 @@ class Course:
         together = self._config.composition == "together"
         deferred = self._config.plates_share > 0 and not together
         behind: Backgrounds = self._stand_in() if deferred else {}
+        self._settle_transmission()
         # For every trace on the way to the one that is kept; before the background, as both make clean plates.
         known = self._container()
         spent = within_seconds(self._scene, self._config, run, known)
@@ -313,6 +334,13 @@ class Course:
         views = {name: self._scene.cameras[name] for name in self._scene.train}
         frozen = {name: freeze(*background.gaussians(camera), camera) for name, camera in views.items()}
         return self._fine(dict.fromkeys(views, background.far_color), traced, _BEFORE, frozen=frozen)
+
+
+def _transmission_settled(config: SplashSplatConfig, share: float) -> SplashSplatConfig:
+    """`config` for a liquid through which `share` of the background's texture shows."""
+    if config.transmission != "measured":
+        return config
+    return config.model_copy(update={"transmission": "always" if share >= _TRANSMITS else "never"})
 
 
 def _plates_of(scene: TrainingScene) -> Callable[[], Plates]:

@@ -113,7 +113,8 @@ class FittedSplashSplat(Fitted):
                 )[0]
                 for ids, state in carriers
             ]
-        return Children(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Children)))
+        tables = [[getattr(part, f.name) for part in parts] for f in fields(Children)]
+        return Children(*(None if table[0] is None else torch.cat(table) for table in tables))
 
     def _eye(self, place: np.ndarray) -> torch.Tensor:
         return torch.tensor(place, dtype=torch.float32, device=self._device)
@@ -152,12 +153,18 @@ class FittedSplashSplat(Fitted):
 
     @torch.no_grad()
     def gaussians(self, time: float, eye: np.ndarray) -> Gaussians:
-        """The carriers' children, coloured as `eye` [3] sees them; what the container hides is among them."""
+        """The carriers' children, coloured as `eye` [3] sees them; what the container hides is among them.
+
+        Of transparent liquid each is as opaque as leaves the background its share, so that it shows the same over it.
+        """
         carriers = self._carriers(time)
         if not carriers:
             return Gaussians.none()
         children = self._decoded(carriers, eye).to(CPU)
-        parts = (children.means, children.factors, children.opacities, children.colors)
+        opacities = children.opacities
+        if children.transmittances is not None:
+            opacities = opacities * (1 - children.transmittances)
+        parts = (children.means, children.factors, opacities, children.colors)
         return Gaussians(*(part.flatten(0, 1).numpy() for part in parts))
 
     def static_gaussians(self, eye: np.ndarray) -> Gaussians:

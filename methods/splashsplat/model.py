@@ -265,6 +265,8 @@ class Liquid:
             settings = DecoderSettings(
                 **{key.replace("colour", "color"): value for key, value in header["decoder"].items()}
             )
+            if not isinstance(settings.transmission, bool) or (settings.transmission and composition == "together"):
+                raise ValueError("its transmission is not that of liquid over a background")
             if not 1 <= max(settings.feature_size, settings.children, settings.color_width) <= _WIDEST:
                 raise ValueError(f"the decoder's sizes are not between 1 and {_WIDEST}")
             decoder = Decoder(settings)

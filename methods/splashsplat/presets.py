@@ -67,6 +67,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "velocity_steps": 35,
         "velocity_carry_on": False,
         "composition": "together",
+        "transmission": "never",
         "between_frames": "forward",
         "validation_share": 0.0,
         "prune_opacity": 0.0,

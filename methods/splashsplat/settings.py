@@ -31,11 +31,14 @@ if TYPE_CHECKING:
     from ..scaffold_gs import BackgroundSettings
 
 
+#: Whether liquid shows what is behind it; "measured" is settled before a fit (course.py).
+Transmission = Literal["measured", "always", "never"]
+
 # Share of the iterations, the last ones, in which it is measured what may be stored how coarsely.
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "31"
+VERSION = "32"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -158,6 +161,9 @@ class SplashSplatConfig(MethodConfig):
     opacity_band: PositiveFloat = 20.0
     #: the logit of every Gaussian's opacity at the start
     opacity_bias: float = -1.0
+    #: each Gaussian shows a share of what lies behind the liquid: "always", "never", or as is "measured" in photographs
+    #: and clean plates; only where the liquid is drawn "over" the background (`composition`)
+    transmission: Transmission = "measured"
     #: what stands in the exponent of a Gaussian's size: its head's answer "bounded" to within 2 and -2, or as it is
     scale_residual: ScaleResidual = "bounded"
     # Optimisation
@@ -275,6 +281,12 @@ class SplashSplatConfig(MethodConfig):
             )
         return self
 
+    @model_validator(mode="after")
+    def _transmission_over_a_background(self) -> SplashSplatConfig:
+        if self.transmission == "always" and self.composition == "together":
+            raise ValueError('transmission="always" needs composition="over"')
+        return self
+
     @property
     def control_factor(self) -> int:
         """Transport voxels per control cell."""
@@ -378,6 +390,7 @@ class SplashSplatConfig(MethodConfig):
             opacity_band=self.opacity_band,
             opacity_bias=self.opacity_bias,
             scale_residual=self.scale_residual,
+            transmission=self.transmission == "always",
         )
 
     @property

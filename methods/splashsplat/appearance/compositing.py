@@ -1,11 +1,13 @@
 """Liquid over its background: the image of a window, and the opacity of the liquid alone (Eq. rendering).
 
 Liquid lies in front of the background, is drawn together with it by depth, is cut by a container's near wall, or stands
-behind a container's glass.
+behind a container's glass. Of transparent liquid the background shows through.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,76 @@ from splashbench.scene.camera import Camera
 
 from .decoder import Children
 from .glass import Splats
+
+
+@dataclass(frozen=True)
+class _Gaussians:
+    """n Gaussians: means [n, 3], factors [n, 3, 3], opacities [n], colors [n, 3], and what shows through them [n], see
+    `Children.transmittances`."""
+
+    means: Tensor
+    factors: Tensor
+    opacities: Tensor
+    colors: Tensor
+    transmittances: Tensor | None
+
+    @classmethod
+    def of(cls, children: Children) -> _Gaussians:
+        """Of all carriers, in their order."""
+        shown_through = children.transmittances
+        return cls(
+            children.means.flatten(0, 1),
+            children.factors.flatten(0, 1),
+            children.opacities.flatten(),
+            children.colors.flatten(0, 1),
+            None if shown_through is None else shown_through.flatten(),
+        )
+
+    @property
+    def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.means, self.factors, self.opacities
+
+    @property
+    def tables(self) -> list[Tensor]:
+        """All there are, for `of_tables`."""
+        tables = [*self.shapes, self.colors]
+        return tables if self.transmittances is None else [*tables, self.transmittances]
+
+    @classmethod
+    def of_tables(cls, tables: Sequence[Tensor]) -> _Gaussians:
+        means, factors, opacities, colors, *shown_through = tables
+        return cls(means, factors, opacities, colors, shown_through[0] if shown_through else None)
+
+    @property
+    def channels(self) -> Tensor:
+        """What they add to a pixel for each unit of their compositing weight: colour, and where there is transmission
+        the share of the background, [n, 3 or 4]."""
+        if self.transmittances is None:
+            return self.colors
+        shown_through = self.transmittances[:, None]
+        return torch.cat([(1 - shown_through) * self.colors, shown_through], 1)
+
+    def drawn(self, camera: Camera, background: Tensor, alone: bool = False) -> tuple[Tensor, Tensor]:
+        """Over the `background`; image [h, w, 3] and opacity [h, w]. alone: it shows through them, and not beside."""
+        if self.transmittances is None:
+            return _rasterized(*self.shapes, self.colors, camera, None if alone else background)
+        beside = background.new_tensor([0, 0, 0, 0 if alone else 1])
+        drawn, alpha = _rasterized(*self.shapes, self.channels, camera, beside)
+        return _before(drawn, background), alpha
+
+
+def _rasterized(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, camera: Camera, background: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    image: Tensor
+    alpha: Tensor
+    image, alpha = rasterize(means, factors, opacities, colors, camera, background=background)
+    return image, alpha
+
+
+def _before(drawn: Tensor, background: Tensor) -> Tensor:
+    """`drawn` [h, w, 4 or more], its fourth channel the share of the `background` [h, w, 3] or [3], with that share."""
+    return drawn[..., :3] + drawn[..., 3:4] * background
 
 
 def composite(
@@ -38,58 +110,64 @@ def composite(
     in which colours are needed, for the former. wall: [h, w], share of each pixel in which a container's near wall,
     which the background shows, lies before the liquid; in_front: bool [n], carriers that lie before it all the same.
     glass: Gaussians that are no liquid, drawn in one order of depth with the liquid's.
-    Only one of frozen, wall and glass. The opacity is "obtained by rasterizing G^fg alone" (supplement).
+    Only one of frozen, wall and glass, and no frozen ones with transmittances. The opacity is "obtained by rasterizing
+    G^fg alone" (supplement).
+
+    Of transparent liquid, with w_i the compositing weights, c_i the colours, tau_i the transmittances and B the
+    background,
+
+        rgb = sum_i w_i ((1 - tau_i) c_i + tau_i B) + (1 - sum_i w_i) B,   opacity = sum_i w_i
+
+    so that the liquid covers what its outline does, and shows what is behind it. Not in the paper.
     """
-    shapes = children.means.flatten(0, 1), children.factors.flatten(0, 1), children.opacities.flatten()
-    colors = children.colors.flatten(0, 1)
+    liquid = _Gaussians.of(children)
     image: Tensor
     alpha: Tensor
     if glass is not None:
         assert frozen is None
         assert wall is None
-        image, alpha = _with_glass(shapes, colors, camera, background, glass)
+        image, alpha = _with_glass(liquid, camera, background, glass)
     elif frozen is None and wall is not None:
-        image, alpha = _behind_wall(shapes, colors, camera, background, wall, in_front)
+        image, alpha = _behind_wall(liquid, camera, background, wall, in_front)
     elif frozen is None:
-        image, alpha = rasterize(*shapes, colors, camera, background=background)
+        image, alpha = liquid.drawn(camera, background)
     else:
-        image, _ = rasterize(*shapes, colors, camera, background=background, frozen=frozen, modes=modes)
-        _, alpha = rasterize(*shapes, None, camera)
+        assert liquid.transmittances is None
+        image, _ = rasterize(*liquid.shapes, liquid.colors, camera, background=background, frozen=frozen, modes=modes)
+        _, alpha = rasterize(*liquid.shapes, None, camera)
     return image, alpha
 
 
-def _with_glass(
-    shapes: tuple[Tensor, Tensor, Tensor], colors: Tensor, camera: Camera, background: Tensor, glass: Splats
-) -> tuple[Tensor, Tensor]:
+def _with_glass(liquid: _Gaussians, camera: Camera, background: Tensor, glass: Splats) -> tuple[Tensor, Tensor]:
     """`composite` where glass stands before the liquid: its share of each pixel is a channel of its own."""
     theirs = glass.means, glass.factors, glass.opacities
-    means, factors, opacities = (torch.cat(pair) for pair in zip(shapes, theirs))
-    parts = [torch.cat([c, c.new_full((len(c), 1), is_liquid)], 1) for c, is_liquid in ((colors, 1), (glass.colors, 0))]
-    behind = torch.cat([background, background.new_zeros(*background.shape[:-1], 1)], -1)
-    drawn, _ = rasterize(means, factors, opacities, torch.cat(parts), camera, background=behind)
-    return drawn[..., :3], drawn[..., 3]
+    means, factors, opacities = (torch.cat(pair) for pair in zip(liquid.shapes, theirs))
+    shown = liquid.channels
+    others = torch.cat([glass.colors, glass.colors.new_zeros(len(glass.colors), shown.shape[1] - 3)], 1)
+    parts = [torch.cat([c, c.new_full((len(c), 1), is_liquid)], 1) for c, is_liquid in ((shown, 1), (others, 0))]
+    if liquid.transmittances is None:
+        behind = torch.cat([background, background.new_zeros(*background.shape[:-1], 1)], -1)
+    else:
+        behind = background.new_tensor([0, 0, 0, 1, 0])
+    drawn, _ = _rasterized(means, factors, opacities, torch.cat(parts), camera, behind)
+    image = drawn[..., :3] if liquid.transmittances is None else _before(drawn, background)
+    return image, drawn[..., -1]
 
 
 def _behind_wall(
-    shapes: tuple[Tensor, Tensor, Tensor],
-    colors: Tensor,
-    camera: Camera,
-    background: Tensor,
-    wall: Tensor,
-    in_front: Tensor | None,
+    liquid: _Gaussians, camera: Camera, background: Tensor, wall: Tensor, in_front: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """`composite` where a wall cuts the liquid, except for the carriers `in_front` of it."""
     if in_front is None or not bool(in_front.any()):
-        image, alpha = rasterize(*shapes, colors, camera, background=background)
-        return _cut(image, alpha, background, wall)
+        return _cut(*liquid.drawn(camera, background), background, wall)
     # Children of one carrier follow each other.
-    drawn_last = in_front.repeat_interleave(len(colors) // len(in_front))
+    drawn_last = in_front.repeat_interleave(len(liquid.colors) // len(in_front))
     first, last = ((~drawn_last).nonzero()[:, 0], drawn_last.nonzero()[:, 0])
-    means, factors, opacities, rgb, *before = _Parts.apply(first, last, *shapes, colors)
-    image, alpha = rasterize(means, factors, opacities, rgb, camera, background=background)
-    image, alpha = _cut(image, alpha, background, wall)
-    means, factors, opacities, rgb = before
-    over, opacity = rasterize(means, factors, opacities, rgb, camera)
+    parts = _Parts.apply(first, last, *liquid.tables)
+    half = len(parts) // 2
+    below, above = _Gaussians.of_tables(parts[:half]), _Gaussians.of_tables(parts[half:])
+    image, alpha = _cut(*below.drawn(camera, background), background, wall)
+    over, opacity = above.drawn(camera, background, alone=True)
     if image.device.type != CPU:
         return over + (1 - opacity[..., None]) * image, opacity + (1 - opacity) * alpha
     composited: tuple[Tensor, Tensor] = _Over.apply(over, opacity, image, alpha)

@@ -1,7 +1,8 @@
 """Decoding carriers into Gaussians (paper, "Decoding Carriers into Gaussians", Eqs. child_position and sdf_opacity).
 
 Heads shared by all carriers and frames turn a carrier's feature f into K children in its frame A = F diag(s). Offset,
-scale and opacity come from linear heads, colour from a two-layer perceptron that also sees the viewing direction.
+scale and opacity come from linear heads, colour from a two-layer perceptron that also sees the viewing direction. Of
+transparent liquid a further linear head says how much of what lies behind it shows through, which is not in the paper.
 `Decoder.forward` is the definition, in plain torch; `Decoder.decode` computes the same, on the CPU by the kernel of
 splashbench_methods.splashsplat.kernel.decode, which has the bounded scale residual alone.
 """
@@ -23,6 +24,8 @@ from . import losses
 # supplement.
 _START_DIRECTIONS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 _START_DISTANCE = 0.5
+# The logit of every Gaussian's transmittance at the start.
+_START_TRANSMITTANCE = -1.0
 
 
 #: r of the scales s exp(eta_s r): the head's answer, "linear" as in the paper, or "bounded" to within 2 and -2
@@ -31,7 +34,8 @@ ScaleResidual = Literal["bounded", "linear"]
 
 @dataclass(frozen=True)
 class DecoderSettings:
-    """offset_bound is beta, scale_range eta_s, opacity_slope kappa_alpha, opacity_band tau_alpha (transport voxels)."""
+    """offset_bound is beta, scale_range eta_s, opacity_slope kappa_alpha, opacity_band tau_alpha (transport voxels).
+    transmission: what lies behind the liquid shows through it."""
 
     feature_size: int = 32
     children: int = 2
@@ -42,18 +46,24 @@ class DecoderSettings:
     opacity_band: float = 3.0
     opacity_bias: float = 1.0
     scale_residual: ScaleResidual = "bounded"
+    transmission: bool = False
 
 
 @dataclass
 class Children:
     """n carriers' K children: means [n, K, 3], factors [n, K, 3, 3] of their covariances B B^T (scene units), opacities
-    [n, K], colors [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units."""
+    [n, K], colors [n, K, 3] in [0, 1], offsets [n, K, 3] in carrier units.
+
+    transmittances: [n, K] in [0, 1], the share of what a Gaussian shows that is the background behind it, and not its
+    color; None where it shows its color alone. Opacities are those of both.
+    """
 
     means: Tensor
     factors: Tensor
     opacities: Tensor
     colors: Tensor
     offsets: Tensor
+    transmittances: Tensor | None = None
 
     def to(self, device: str) -> Children:
         """The same on `device`."""
@@ -63,6 +73,7 @@ class Children:
             self.opacities.to(device),
             self.colors.to(device),
             self.offsets.to(device),
+            None if self.transmittances is None else self.transmittances.to(device),
         )
 
 
@@ -100,7 +111,7 @@ def penalties(children: Children, cells: ColorCells) -> Penalties:
 
 
 class Decoder(nn.Module):
-    """The heads g_o, g_s, g_alpha (linear) and g_c (two layers)."""
+    """The heads g_o, g_s, g_alpha (linear) and g_c (two layers); where liquid is transparent, one more (linear)."""
 
     def __init__(self, settings: DecoderSettings) -> None:
         super().__init__()
@@ -111,19 +122,33 @@ class Decoder(nn.Module):
         self.opacity = nn.Linear(size, k)
         self.color_hidden = nn.Linear(size + 3, settings.color_width)
         self.color_out = nn.Linear(settings.color_width, 3 * k)
+        if settings.transmission:
+            self.transmittance = nn.Linear(size, k)
         with torch.no_grad():
-            for head in (self.offset, self.scale, self.opacity):
+            for head in self.linear_heads:
                 head.weight.mul_(0.3)  # children start alike, near the values the biases give
             self.scale.bias.zero_()
             self.opacity.bias.fill_(settings.opacity_bias)
             starts = torch.tensor([_START_DIRECTIONS[i % 6] for i in range(k)], dtype=torch.float32)
             starts = starts * (_START_DISTANCE if k > 1 else 0.0) / settings.offset_bound
             self.offset.bias.copy_(torch.atanh(starts.clamp(-0.99, 0.99)).reshape(-1))
+            if settings.transmission:
+                self.transmittance.bias.fill_(_START_TRANSMITTANCE)
+
+    @property
+    def linear_heads(self) -> list[nn.Linear]:
+        """All but that of the color."""
+        heads = [self.offset, self.scale, self.opacity]
+        return [*heads, self.transmittance] if self.settings.transmission else heads
 
     def offsets(self, features: Tensor) -> Tensor:
         """o = beta tanh(g_o(f)), [n, K, 3]."""
         raw = self.offset(features).view(len(features), self.settings.children, 3)
         return self.settings.offset_bound * torch.tanh(raw)
+
+    def transmittances(self, features: Tensor) -> Tensor | None:
+        """The share of what lies behind n carriers' children that shows through them, [n, K]; None for opaque ones."""
+        return torch.sigmoid(self.transmittance(features)) if self.settings.transmission else None
 
     def forward(self, features: Tensor, log_scales: Tensor, state: CarrierState, eye: Tensor) -> Children:
         """Children of n carriers seen from `eye` [3].
@@ -150,7 +175,7 @@ class Decoder(nn.Module):
         direction = nn.functional.normalize(state.positions - eye, dim=1)
         hidden = torch.relu(self.color_hidden(torch.cat([features, direction], dim=1)))
         colors = torch.sigmoid(self.color_out(hidden)).view(n, k, 3)
-        return Children(means, factors, opacities, colors, offsets)
+        return Children(means, factors, opacities, colors, offsets, self.transmittances(features))
 
     def decode(
         self,
@@ -168,8 +193,12 @@ class Decoder(nn.Module):
         if compiled and all(table.device.type == "cpu" and table.dtype == torch.float32 for table in tables):
             groups = () if cells is None else (cells.of_carriers, len(cells.sizes))
             instant = Instant(state.positions, state.deformation, state.phi, eye, state.visibility, *groups)
-            *children, terms = decode(self.heads(), *tables, instant, rows)
-            return Children(*children), None if terms is None else Penalties(*terms.unbind())
+            means, factors, opacities, colors, offsets, terms = decode(self.heads(), *tables, instant, rows)
+            # The kernel knows nothing of these: one more layer, and of transparent liquid alone.
+            own = features if rows is None else nn.functional.embedding(rows, features, sparse=True)
+            shown_through = self.transmittances(own)
+            children = Children(means, factors, opacities, colors, offsets, shown_through)
+            return children, None if terms is None else Penalties(*terms.unbind())
         if rows is not None:
             features, log_scales = (nn.functional.embedding(rows, table, sparse=True) for table in tables)
         result = self(features, log_scales, state, eye)

@@ -185,6 +185,6 @@ def take_on(look: Look, features: torch.Tensor, decoder: Decoder) -> None:
             hidden.weight[unit, channel] = sign
             out.weight[channel::3, unit] = sign
     # What the other heads would make of these features is noise, too.
-    for head in (decoder.offset, decoder.scale, decoder.opacity):
+    for head in decoder.linear_heads:
         head.weight[:, :GIVEN] = 0
     decoder.opacity.weight[:, _CERTAINTY] = 1

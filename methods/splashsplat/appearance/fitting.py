@@ -329,7 +329,7 @@ def fit_appearance(
             return least(found, settings.idle_share)
 
         def drawn(colors: Tensor) -> Tensor:
-            return shown(replace(children, colors=colors), whole, active)[0]
+            return shown(replace(children, colors=colors, transmittances=None), whole, active)[0]
 
         return least(contributions(children.colors, drawn), settings.idle_share).cpu()
 
