@@ -6,15 +6,14 @@ describes the files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import compressed_bytes, read_json, read_npz, write_json, write_npz
+from splashbench.files import read_json, write_json
 from splashbench.observe.grid import Grid
 from splashbench.scene.geometry import MAX_BYTES, SignedDistance
 from splashbench.scene.particles import Particles, even_share, most_particles
@@ -31,30 +30,17 @@ from .fields.sparse_frames import Frames
 from .motion.between import moved_distance
 from .motion.steps import Motion
 from .motion.velocity import Factor
-from .storage.earlier import EARLIER, UNSORTED, UNSORTED_VALUES, read_earlier, sorted_by_coarseness
-from .storage.looks import VALUES, appearance_arrays, appearance_ranks, learned_values, read_appearance
-from .storage.track import (
-    CARRIERS,
-    DEFORMATION,
-    DISTANCE,
-    MOTION,
-    carrier_arrays,
-    distance_arrays,
-    motion_arrays,
-    read_track,
-)
+from .storage.archives import AGAIN, FORMAT, UNCODED, Archives, Stated, fitting, read_archives
+from .storage.earlier import EARLIER, UNSORTED, read_earlier
+from .storage.looks import appearance_arrays, learned_values, read_appearance
+from .storage.track import carrier_arrays, motion_arrays, read_track
 
-T = TypeVar("T")
-
-FORMAT = 6
 # Step in which values are stored where nothing is known of the photographs, of their spread.
 _UNKNOWN_STEP = 0.05
-_AGAIN = "fit the scene again"
 # Of a decoder, before it is made: a header may ask for any size.
 _WIDEST = 4096
 # Nodes of the transport grid between those of a velocity field that is handed out: u_t is coarser still.
 _NODES_APART = 2
-_FILES = ("carriers", "motion", "distance", "appearance")
 
 
 def _factor(stored: int | list[float]) -> Factor:
@@ -216,12 +202,12 @@ class Liquid:
     @property
     def stored_bytes(self) -> int:
         """How much `save` writes, to within some kilobytes."""
-        return sum(compressed_bytes(self._stored(name)) for name in _FILES)
+        return Archives(self.arrays, self.phi).stored_bytes
 
     def save(self, directory: Path) -> None:
         """Write liquid.json and four .npz files into `directory`."""
         if not self.arrays:
-            raise SplashbenchError(f"a model of an earlier version cannot be written again; {_AGAIN}")
+            raise SplashbenchError(f"a model of an earlier version cannot be written again; {AGAIN}")
         header = {
             "format": FORMAT,
             "times": [float(t) for t in self.times],
@@ -239,12 +225,7 @@ class Liquid:
             "decoder": dict(vars(self.appearance.decoder.settings)),
         }
         write_json(directory / "liquid.json", header)
-        for name in _FILES:
-            write_npz(directory / f"{name}.npz", self._stored(name))
-
-    def _stored(self, name: str) -> Mapping[str, np.ndarray]:
-        """What the file `name` holds."""
-        return distance_arrays(self.phi) if name == "distance" else self.arrays[name]
+        Archives(self.arrays, self.phi).write(directory)
 
     @classmethod
     def load(cls, directory: Path) -> Liquid:
@@ -252,8 +233,8 @@ class Liquid:
         path = directory / "liquid.json"
         header = read_json(path)
         try:
-            if header["format"] not in (FORMAT, UNSORTED, *EARLIER):
-                raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; {_AGAIN}")
+            if header["format"] not in (FORMAT, UNCODED, UNSORTED, *EARLIER):
+                raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; {AGAIN}")
             box = header["grid"]
             nx, ny, nz = (int(n) for n in box["shape"])
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
@@ -270,38 +251,18 @@ class Liquid:
             if not 1 <= max(settings.feature_size, settings.children, settings.color_width) <= _WIDEST:
                 raise ValueError(f"the decoder's sizes are not between 1 and {_WIDEST}")
             decoder = Decoder(settings)
-            precision = HIGHEST if header["format"] != FORMAT else Precision.stored(header["steps"])
+            precision = Precision.stored(header["steps"]) if header["format"] in (FORMAT, UNCODED) else HIGHEST
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); {_AGAIN}") from None
-        arrays: dict[str, dict[str, np.ndarray]] = {}
+            raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); {AGAIN}") from None
         if header["format"] in EARLIER:
-            track, look = _fitting(directory, lambda: read_earlier(directory, header, grid, times, factor, decoder))
-        else:
-            unsorted = header["format"] == UNSORTED
-            values = UNSORTED_VALUES if unsorted else VALUES
-            ranks = {
-                "carriers": {**CARRIERS, **({} if carried else DEFORMATION)},
-                "motion": MOTION,
-                "distance": DISTANCE,
-                "appearance": appearance_ranks(decoder, bool(header.get("glass")), values),
-            }
-            arrays = {name: read_npz(directory / f"{name}.npz", ranks[name]) for name in _FILES}
-            if unsorted:
-                look_path = directory / "appearance.npz"
-                arrays["appearance"] = _fitting(look_path, lambda: sorted_by_coarseness(arrays["appearance"]))
-            track = _fitting(directory, lambda: read_track(arrays, grid, times, factor, precision))
-            count = len(arrays["appearance"]["coarseness"])
-            if count != track.carriers.count:
-                others = f"{count} carriers, not {track.carriers.count}"
-                raise SplashbenchError(f"{directory / 'appearance.npz'} has {others}; {_AGAIN}")
-            look = _fitting(directory / "appearance.npz", lambda: read_appearance(arrays["appearance"], decoder, grid))
-            del arrays["distance"]  # large, and phi again
-        return cls._of_parts(times, track, look, carried, composition, between, arrays)
-
-
-def _fitting(path: Path, read: Callable[[], T]) -> T:
-    """What `read` returns; SplashbenchError where the files at `path` do not fit liquid.json."""
-    try:
-        return read()
-    except (IndexError, KeyError, OverflowError, RuntimeError, ValueError) as error:
-        raise SplashbenchError(f"{path} does not fit liquid.json ({error}); {_AGAIN}") from None
+            track, look = fitting(directory, lambda: read_earlier(directory, header, grid, times, factor, decoder))
+            return cls._of_parts(times, track, look, carried, composition, between, {})
+        stated = Stated(header["format"], (len(times), *grid.shape), carried, bool(header.get("glass")), decoder)
+        read = read_archives(directory, stated)
+        track = fitting(directory, lambda: read_track(read.arrays, read.phi, grid, times, factor, precision))
+        values = read.arrays["appearance"]
+        if (count := len(values["coarseness"])) != track.carriers.count:
+            others = f"{count} carriers, not {track.carriers.count}"
+            raise SplashbenchError(f"{directory / 'appearance.npz'} has {others}; {AGAIN}")
+        look = fitting(directory / "appearance.npz", lambda: read_appearance(values, decoder, grid))
+        return cls._of_parts(times, track, look, carried, composition, between, read.arrays)

@@ -31,6 +31,7 @@ from .carriers.subframe import Track
 from .fields.occlusion import LiquidOcclusion
 from .model import Liquid
 from .settings import SplashSplatConfig
+from .storage.packing import pack_distance, packed_bytes
 from .storage.steps import Storage, Stored
 from .storage.track import carrier_arrays, track_arrays
 from .trace import Traced
@@ -146,10 +147,10 @@ def _within_tolerance(
     if room is None:
         return stored
     arrays = track_arrays(track, config.carried)
-    fixed = _HEADER + sum(compressed_bytes(arrays[name]) for name in ("motion", "distance"))
+    fixed = _HEADER + packed_bytes(arrays["motion"]) + compressed_bytes(pack_distance(track.phi))
 
     def other_bytes(kept: np.ndarray) -> int:
-        return fixed + compressed_bytes(carrier_arrays(track, track.carriers.keep(kept)[0], config.carried))
+        return fixed + packed_bytes(carrier_arrays(track, track.carriers.keep(kept)[0], config.carried))
 
     stored, spent = storage.within_room(room - _glass_bytes(appearance), stored, other_bytes)
     if spent is not None:

@@ -30,6 +30,7 @@ from .motion.observed_frames import observed_frames
 from .motion.steps import FrameStep, Motion
 from .motion.velocity import control_shape
 from .settings import SplashSplatConfig
+from .storage.packing import pack_distance, packed_bytes
 from .storage.signed_distance import coarse_distance, reach
 from .storage.track import stored_track, track_arrays
 
@@ -50,7 +51,8 @@ class Traced:
     def track_bytes(self) -> dict[str, int]:
         """How much of the files the track takes: "carriers", "motion" and "distance"."""
         arrays = track_arrays(self.track, self.config.carried)
-        return {name: compressed_bytes(file) for name, file in arrays.items()}
+        sizes = {name: packed_bytes(file) for name, file in arrays.items()}
+        return sizes | {"distance": compressed_bytes(pack_distance(self.track.phi))}
 
     def keep(self, chosen: np.ndarray) -> np.ndarray:
         """Go on with the carriers `chosen` (bool [count]) alone; returns the numbers that they had, int64. In place, so

@@ -3,13 +3,28 @@
 #include "api.h"
 
 #include <cstdint>
+#include <cstring>
 
 #include "adam.h"
 #include "decode.h"
 #include "descend.h"
+#include "entropy.h"
 #include "native/threads.h"
 #include "shared.h"
 #include "window_loss.h"
+
+namespace {
+
+template <class Work>
+int coded(Work work) {
+    try {
+        return work() ? SPLASH_DONE : SPLASH_NOT_FINITE;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return SPLASH_OUT_OF_MEMORY;
+    }
+}
+
+}  // namespace
 
 extern "C" {
 
@@ -76,6 +91,41 @@ int splash_window_gradients(const SplashWindow* window, const float* image, cons
 
 void splash_descend(const SplashDescent* descent, float* update, float* residual, int32_t threads) {
     splash::descend(*descent, update, residual, splash::workers(threads));
+}
+
+SplashCode* splash_code_begin(const uint8_t* code, int64_t size) {
+    try {
+        return new SplashCode(code, size);
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return nullptr;
+    }
+}
+
+void splash_code_end(SplashCode* code) { delete code; }
+
+int splash_code_table(SplashCode* code, int32_t* table, int64_t rows, int32_t columns, int32_t near) {
+    return coded([&] { return splash::code_table(*code, table, rows, columns, near); });
+}
+
+int splash_code_field(SplashCode* code, int16_t* field, const int64_t shape[5]) {
+    return coded([&] { return splash::code_field(*code, field, shape); });
+}
+
+int splash_code_frame(SplashCode* code, int8_t* now, const int8_t* before, uint8_t* changed, const int64_t shape[3],
+                      int32_t least, int32_t most) {
+    return coded([&] { return splash::code_frame(*code, now, before, changed, shape, least, most); });
+}
+
+int64_t splash_code_finish(SplashCode* code) {
+    try {
+        return code->writes ? splash::code_finished(*code) : code->size - code->at;
+    } catch (...) {  // nothing but std::bad_alloc is thrown
+        return -1;
+    }
+}
+
+void splash_code_copy(const SplashCode* code, uint8_t* out) {
+    if (!code->out.empty()) std::memcpy(out, code->out.data(), code->out.size());
 }
 
 const char* splash_kernel(void) { return "splashsplat"; }

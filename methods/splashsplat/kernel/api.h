@@ -11,7 +11,7 @@ extern "C" {
 #endif
 
 // Raised with every change to what follows; the loader refuses another version.
-#define SPLASH_ABI_VERSION 3
+#define SPLASH_ABI_VERSION 4
 
 // Heads that turn n carriers' features into K children each (decode.py): weights [outputs, inputs], biases [outputs].
 typedef struct SplashHeads {
@@ -130,6 +130,26 @@ typedef struct SplashDescent {
 
 // Sums over each control cell's nodes: of displacements [cells, 3] and of absolute residuals [cells].
 SPLASH_API void splash_descend(const SplashDescent*, float* update, float* residual, int32_t threads);
+
+// Bytes that whole numbers become, or come from (entropy.h). code: to be read, and there until the end; null: to be
+// written. Null: out of memory.
+typedef struct SplashCode SplashCode;
+SPLASH_API SplashCode* splash_code_begin(const uint8_t* code, int64_t size);
+SPLASH_API void splash_code_end(SplashCode*);
+
+// What is written or read next: a table [rows, columns] of numbers of up to 31 bits and a sign, whose context are the rows
+// before (near 1), and the columns before as well (2); a field [frames, nx, ny, nz, components]; a frame [nx, ny, nz] of
+// signed distances from `least` to `most`. before: the frame before it. now: when reading, a copy of it. changed: which
+// blocks of 4x4x4 nodes changed last, and then now; zeros at first. SPLASH_NOT_FINITE: no writer gave such a code.
+SPLASH_API int splash_code_table(SplashCode*, int32_t* table, int64_t rows, int32_t columns, int32_t near);
+SPLASH_API int splash_code_field(SplashCode*, int16_t* field, const int64_t shape[5]);
+SPLASH_API int splash_code_frame(SplashCode*, int8_t* now, const int8_t* before, uint8_t* changed, const int64_t shape[3],
+                                 int32_t least, int32_t most);
+
+// Ends what is written, and says how many bytes these are; splash_code_copy has them. Negative: out of memory. When
+// reading: how many bytes are left, below zero where there were too few.
+SPLASH_API int64_t splash_code_finish(SplashCode*);
+SPLASH_API void splash_code_copy(const SplashCode*, uint8_t* out);
 
 #ifdef __cplusplus
 }

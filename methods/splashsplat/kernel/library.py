@@ -153,6 +153,13 @@ _FUNCTIONS: dict[str, Signature] = {
     "splash_adam_rows": (None, (POINTER(RowAdamStruct), c_int64, c_void_p, c_void_p, c_float, c_int32)),
     "splash_sum_rows": (None, (POINTER(SharedRowsStruct), c_int64, c_void_p, c_void_p, c_int32)),
     "splash_add_by_member": (None, (c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_int64, c_void_p)),
+    "splash_code_begin": (c_void_p, (c_void_p, c_int64)),
+    "splash_code_end": (None, (c_void_p,)),
+    "splash_code_table": (c_int32, (c_void_p, c_void_p, c_int64, c_int32, c_int32)),
+    "splash_code_field": (c_int32, (c_void_p, c_void_p, c_int64 * 5)),
+    "splash_code_frame": (c_int32, (c_void_p, c_void_p, c_void_p, c_void_p, c_int64 * 3, c_int32, c_int32)),
+    "splash_code_finish": (c_int64, (c_void_p,)),
+    "splash_code_copy": (None, (c_void_p, c_void_p)),
     "splash_descend": (None, (POINTER(DescentStruct), c_void_p, c_void_p, c_int32)),
     "splash_window_losses": (c_int32, (POINTER(WindowStruct), c_void_p, c_void_p, c_double * 3, c_int32)),
     "splash_window_gradients": (
@@ -161,4 +168,4 @@ _FUNCTIONS: dict[str, Signature] = {
     ),
 }
 
-KERNEL = CompiledKernel("splashsplat", Path(__file__).parent, abi_version=3, functions=_FUNCTIONS)
+KERNEL = CompiledKernel("splashsplat", Path(__file__).parent, abi_version=4, functions=_FUNCTIONS)

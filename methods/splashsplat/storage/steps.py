@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from splashbench.files import compressed_bytes
 from splashbench.harness.contract import Decision, Rung
 
 from ..appearance.fitting import Appearance, Fit
+from .packing import packed_bytes
 from .tolerance import Loss, Trial, longest_step
 from .values import StoredValues, read_values, store_values, typical_coefficient
 
@@ -153,7 +153,7 @@ class Storage:
         return store_values(self._learned(rows), self._known.kept(rows), stored.step)
 
     def _value_bytes(self, stored: Stored) -> int:
-        return compressed_bytes(self._coded(stored).arrays)
+        return packed_bytes(self._coded(stored).arrays)
 
     def _trial(self, stored: Stored) -> Trial:
         read = torch.from_numpy(read_values(self._coded(stored)))

@@ -18,13 +18,12 @@ from ..motion.fall import falls_of, table_of
 from ..motion.steps import Motion
 from ..motion.velocity import Factor
 from .rows import StoredRows, read_rows, store_rows, stored_order, whole_velocities
-from .signed_distance import read_distance, store_distance
 
 #: Arrays of the files of a track, each with its number of dimensions; `deformation` is optional.
 CARRIERS: Mapping[str, int] = {"births": 1, "lives": 1, "cells": 1, "within": 2, "residuals": 2}
 DEFORMATION: Mapping[str, int] = {"deformation": 3}
 MOTION: Mapping[str, int] = {"velocities": 5, "jets": 2, "turn": 2}
-DISTANCE: Mapping[str, int] = {"phi": 4}
+DISTANCE: Mapping[str, int] = {"phi": 4}  # of format 6 and before
 
 
 def stored_track(track: Track, times: np.ndarray, carried: bool, precision: Precision) -> Track:
@@ -45,17 +44,11 @@ def stored_track(track: Track, times: np.ndarray, carried: bool, precision: Prec
 
 
 def track_arrays(track: Track, carried: bool) -> dict[str, dict[str, np.ndarray]]:
-    """What is stored of a track, by file. Of one that `stored_track` gave, this loses nothing."""
+    """What is stored of a track but phi, by file. Of one that `stored_track` gave, this loses nothing."""
     return {
         "carriers": carrier_arrays(track, track.carriers, carried),
         "motion": motion_arrays(track),
-        "distance": distance_arrays(track.phi),
     }
-
-
-def distance_arrays(phi: Frames) -> dict[str, np.ndarray]:
-    """What is stored of the packed phi of all frames."""
-    return {"phi": store_distance(phi)}
 
 
 def motion_arrays(track: Track) -> dict[str, np.ndarray]:
@@ -74,18 +67,22 @@ def carrier_arrays(track: Track, carriers: Carriers, carried: bool) -> dict[str,
 
 
 def read_track(
-    arrays: Mapping[str, Mapping[str, np.ndarray]], grid: Grid, times: np.ndarray, factor: Factor, precision: Precision
+    arrays: Mapping[str, Mapping[str, np.ndarray]],
+    phi: Frames,
+    grid: Grid,
+    times: np.ndarray,
+    factor: Factor,
+    precision: Precision,
 ) -> Track:
-    """The track of what `track_arrays` gave. Raises ValueError where it does not fit together."""
+    """The track of what `track_arrays` gave, and of its packed phi. Raises ValueError where it does not fit
+    together."""
     n_frames = len(times)
     control = arrays["motion"]["velocities"]
     if control.shape[0] != max(n_frames - 1, 0) or control.shape[4] != 3 or min(control.shape[1:4]) < 2:
         raise ValueError(f"velocities of shape {control.shape} do not fit {n_frames} frames")
-    stored = arrays["distance"]["phi"]
-    if stored.dtype != np.int8 or stored.shape != (n_frames, *grid.shape):
-        raise ValueError(f"phi is {stored.dtype} {stored.shape}, not int8 of {n_frames} frames on {grid.shape} nodes")
+    if phi.shape != (n_frames, *grid.shape):
+        raise ValueError(f"phi is of shape {phi.shape}, not of {n_frames} frames on {grid.shape} nodes")
     motion = _read_motion(arrays["motion"], grid, times, factor, precision)
-    phi = read_distance(stored)
     carriers = _read_carriers(arrays["carriers"], arrays["motion"], motion, phi, grid, precision)
     return Track(grid, carriers, motion, phi, precision)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import resource
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -13,7 +14,6 @@ import pytest
 import torch
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import compressed_bytes
 from splashbench.harness.contract import Run
 from splashbench.scene import Scene
 from splashbench_methods.splashsplat import SplashSplat
@@ -24,8 +24,18 @@ from splashbench_methods.splashsplat.model import Liquid
 from splashbench_methods.splashsplat.motion.steps import Motion
 from splashbench_methods.splashsplat.motion.velocity import factors
 from splashbench_methods.splashsplat.storage import rows, signed_distance, values
+from splashbench_methods.splashsplat.storage.packing import (
+    pack,
+    pack_distance,
+    packed_bytes,
+    unpack_appearance,
+    unpack_carriers,
+    unpack_distance,
+    unpack_motion,
+)
 from splashbench_methods.splashsplat.storage.tolerance import Trial, longest_step
 
+Arrays = dict[str, np.ndarray]
 FILES = ("liquid.json", "carriers.npz", "motion.npz", "distance.npz", "appearance.npz")
 
 
@@ -120,36 +130,108 @@ def test_a_thousand_damages_raise_one_line_and_allocate_no_more_than_the_files_s
     assert grown < 200_000  # kilobytes
 
 
+def changed(directory: Path, name: str, change: Callable[[Arrays], Arrays]) -> None:
+    """The file `name` as it would be with other numbers."""
+    path = directory / f"{name}.npz"
+    with np.load(path) as stored:
+        written = dict(stored)
+    if name == "carriers":
+        np.savez(path, **pack(change(unpack_carriers(written))))
+    elif name == "motion":
+        steps = len(json.loads((directory / "liquid.json").read_text())["times"]) - 1
+        np.savez(path, **pack(change(unpack_motion(written, steps))))
+    elif name == "appearance":
+        with np.load(directory / "carriers.npz") as carriers:
+            count = int(carriers["births"].sum())
+        np.savez(path, **pack(change(unpack_appearance(written, count))))
+    else:
+        raise AssertionError(name)
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [
         ("carriers", lambda a: a | {"lives": a["lives"] + 1}),
-        ("carriers", lambda a: a | {"births": a["births"][:-1]}),
+        ("carriers", lambda a: a | {"lives": 0 * a["lives"]}),
         ("carriers", lambda a: a | {"cells": a["cells"] + 10**6}),
         ("carriers", lambda a: a | {"residuals": a["residuals"][:-1]}),
-        ("motion", lambda a: a | {"velocities": a["velocities"][:-1]}),
-        ("distance", lambda a: a | {"phi": a["phi"][:, :-1]}),
-        ("distance", lambda a: a | {"phi": np.full_like(a["phi"], 100)}),
         ("carriers", lambda a: a | {"within": a["within"] + 32}),
         ("carriers", lambda a: a | {"within": a["within"].astype(np.int8) - 32}),
-        ("carriers", lambda a: a | {"residuals": a["residuals"] + 0.5}),
-        ("motion", lambda a: a | {"velocities": a["velocities"] + 0.5}),
+        ("motion", lambda a: a | {"velocities": a["velocities"][:-1]}),
+        ("motion", lambda a: a | {"velocities": a["velocities"][:, :1]}),
         ("appearance", lambda a: a | {"coefficients.2": a["coefficients.2"][:-1]}),
         ("appearance", lambda a: a | {"coefficients.3": a["coefficients.3"][:, 1:]}),
-        ("appearance", lambda a: a | {"coarseness": a["coarseness"] + 100}),
-        ("appearance", lambda a: a | {"coarseness": a["coarseness"].astype(np.float32)}),
+        ("appearance", lambda a: a | {"coarseness": a["coarseness"].astype(int) + 100}),
         ("appearance", lambda a: a | {"basis": np.full_like(a["basis"], 3e38)}),
     ],
 )
+def test_numbers_that_do_not_fit_together_are_named(
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path, name: str, change: Callable[[Arrays], Arrays]
+) -> None:
+    fitted[0].liquid.save(tmp_path)
+    changed(tmp_path, name, change)
+    with pytest.raises(SplashbenchError, match=r"does not fit|has \d+ carriers"):
+        Liquid.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("carriers", lambda a: a | {"births": a["births"][:-1]}),
+        ("carriers", lambda a: a | {"births": a["births"] + 0.5}),
+        ("carriers", lambda a: a | {"births": a["births"].astype(np.int64) << 40}),
+        ("carriers", lambda a: a | {"residuals": a["residuals"] + 0.5}),
+        ("carriers", lambda a: a | {"lives": a["lives"].astype(np.int64)}),
+        ("carriers", lambda a: a | {"cells": a["cells"][:-2]}),
+        ("motion", lambda a: a | {"velocities": a["velocities"][:0]}),
+        ("motion", lambda a: a | {"nodes": a["nodes"] * 1000}),
+        ("motion", lambda a: a | {"nodes": -a["nodes"]}),
+        ("motion", lambda a: a | {"nodes": a["nodes"][:2]}),
+        ("motion", lambda a: a | {"nodes": a["nodes"] + 0.5}),
+        ("distance", lambda a: a | {"phi": a["phi"][:-1]}),
+        ("distance", lambda a: a | {"phi": np.append(a["phi"], np.uint8(0))}),
+        ("distance", lambda a: a | {"phi": a["phi"][::-1]}),
+        ("distance", lambda a: a | {"ends": a["ends"][::-1]}),
+        ("distance", lambda a: a | {"ends": np.array([-100, 100])}),
+        ("distance", lambda a: a | {"ends": a["ends"] + 0.5}),
+        ("appearance", lambda a: a | {"coarseness": a["coarseness"].astype(np.float32)}),
+        ("appearance", lambda a: a | {"coefficients.1": a["coefficients.4"]}),
+        ("appearance", lambda a: a | {"center": np.tile(a["center"], 10_000)}),
+    ],
+)
 def test_arrays_that_do_not_fit_together_are_named(
-    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path, name: str, change: object
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path, name: str, change: Callable[[Arrays], Arrays]
 ) -> None:
     fitted[0].liquid.save(tmp_path)
     path = tmp_path / f"{name}.npz"
     with np.load(path) as stored:
         arrays = dict(stored)
-    np.savez(path, **change(arrays))  # type: ignore[operator]
-    with pytest.raises(SplashbenchError, match=r"does not fit|has \d+ carriers"):
+    np.savez(path, **change(arrays))
+    with pytest.raises(SplashbenchError, match=r"does not fit"):
+        Liquid.load(tmp_path)
+
+
+def test_carriers_that_never_move_and_none_at_all_are_stored() -> None:
+    for count in (0, 3):
+        carriers = {
+            "births": np.array([count], np.uint32),
+            "lives": np.ones(count, np.uint16),
+            "cells": np.arange(count, dtype=np.int32),
+            "within": np.zeros((count, 3), np.uint8),
+            "residuals": np.zeros((0, 3), np.int8),
+        }
+        found = unpack_carriers(pack(carriers))
+        assert found.keys() == carriers.keys()
+        for name, array in carriers.items():
+            np.testing.assert_array_equal(found[name], array)
+
+
+def test_a_frame_larger_than_any_grid_is_refused(fitted: tuple[FittedSplashSplat, Run], tmp_path: Path) -> None:
+    fitted[0].liquid.save(tmp_path)
+    header = json.loads((tmp_path / "liquid.json").read_text())
+    header["grid"]["shape"] = [4096, 4096, 4096]
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
+    with pytest.raises(SplashbenchError, match=r"distance\.npz does not fit"):
         Liquid.load(tmp_path)
 
 
@@ -179,7 +261,9 @@ def test_phi_is_stored_in_quarters_of_a_voxel_and_keeps_its_sign() -> None:
     packed = np.random.default_rng(0).integers(-127, 128, (5, 4, 3, 6)).astype(np.int8)
     for steps in (signed_distance.reach(2.0, 20.0), signed_distance.reach(2.0, 3.0)):
         coarse = signed_distance.coarse_distance(packed, steps)
-        np.testing.assert_array_equal(signed_distance.read_distance(signed_distance.store_distance(coarse)), coarse)
+        np.testing.assert_array_equal(unpack_distance(pack_distance(coarse), coarse.shape), coarse)
+        changes = np.diff(coarse // np.int8(signed_distance.COARSER), axis=0, prepend=np.int8(0))
+        np.testing.assert_array_equal(signed_distance.distance_of_changes(changes), coarse)
         np.testing.assert_array_equal(coarse < 0, packed < 0)
         near = np.abs(packed) < 4 * steps
         assert np.abs(coarse.astype(int) - packed)[near].max() <= 2
@@ -265,7 +349,7 @@ def test_coarser_steps_take_fewer_bytes(fitted: tuple[FittedSplashSplat, Run]) -
         read = rows.read_rows(stored, control, liquid.motion, liquid.phi, liquid.grid, precision.steps)
         # Half a step at most, or in the last cell a whole one.
         assert np.abs(read.positions - liquid.carriers.positions).max() <= 1 / precision.steps
-        sizes.append(compressed_bytes(vars(stored)))
+        sizes.append(packed_bytes(vars(stored)))
     assert sizes == sorted(sizes, reverse=True)
 
 
@@ -280,12 +364,44 @@ def test_steps_that_no_file_has_are_refused(
         Liquid.load(tmp_path)
 
 
+def uncoded(liquid: Liquid, directory: Path, version: int) -> None:
+    """`liquid` as format 6 has it: the numbers themselves. version: what its header says."""
+    liquid.save(directory)
+    header = json.loads((directory / "liquid.json").read_text())
+    (directory / "liquid.json").write_text(json.dumps(header | {"format": version}))
+    for name, arrays in liquid.arrays.items():
+        np.savez(directory / f"{name}.npz", **arrays)
+    whole = np.asarray(liquid.phi) // np.int8(signed_distance.COARSER)
+    np.savez(directory / "distance.npz", phi=np.diff(whole, axis=0, prepend=np.int8(0)))
+
+
+def test_a_model_of_format_6_is_read_as_it_was(fitted: tuple[FittedSplashSplat, Run], tmp_path: Path) -> None:
+    liquid = fitted[0].liquid
+    uncoded(liquid, tmp_path, 6)
+    before = sum((tmp_path / name).stat().st_size for name in FILES)
+    loaded = Liquid.load(tmp_path)
+    np.testing.assert_array_equal(loaded.carriers.positions, liquid.carriers.positions)
+    np.testing.assert_array_equal(loaded.phi, liquid.phi)
+    torch.testing.assert_close(loaded.appearance.features, liquid.appearance.features, rtol=0, atol=0)
+    loaded.save(tmp_path)  # as it would be today
+    assert json.loads((tmp_path / "liquid.json").read_text())["format"] == 7
+    assert sum((tmp_path / name).stat().st_size for name in FILES) < before
+    np.testing.assert_array_equal(Liquid.load(tmp_path).carriers.positions, liquid.carriers.positions)
+    with np.load(tmp_path / "distance.npz") as stored:
+        code = stored["phi"]
+    uncoded(liquid, tmp_path, 6)
+    for phi in (np.full((*liquid.phi.shape,), 100, np.int8), np.zeros((2, *liquid.grid.shape), np.int8), code):
+        np.savez(tmp_path / "distance.npz", phi=phi)
+        with pytest.raises(SplashbenchError, match=r"distance\.npz"):
+            Liquid.load(tmp_path)
+
+
 def test_a_model_of_format_5_is_read_as_it_was(fitted: tuple[FittedSplashSplat, Run], tmp_path: Path) -> None:
     liquid = fitted[0].liquid
-    liquid.save(tmp_path)
+    uncoded(liquid, tmp_path, 5)
     header = json.loads((tmp_path / "liquid.json").read_text())
     steps = header.pop("steps")
-    (tmp_path / "liquid.json").write_text(json.dumps(header | {"format": 5}))
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
     with np.load(tmp_path / "appearance.npz") as stored:
         look = dict(stored)
     parts = [look.pop(f"coefficients.{level}") for level in range(6)]
