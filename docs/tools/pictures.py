@@ -289,6 +289,29 @@ def unmasked() -> list[Path]:
     return [store(figure, "unmasked.png", 110)]
 
 
+def transmission() -> list[Path]:
+    """A test view of a glass tank, and how far off it is with and without what is behind the liquid showing through."""
+    name, view, t = "glass_tank", "7", 20
+    folder = WORK / f"{name}_240"
+    scene = Scene.open(made(folder, "synth", "scene", name, str(folder), "--size", "240x160", "--times-alone"))
+    mask, truth = scene.mask(view, t), scene.image(view, t)
+    crop = window(mask)
+    figure = Figure(figsize=(11, 4.4), layout="constrained")
+    panels = iter(figure.subplots(1, 5).flat)
+    bare(next(panels), "truth").imshow(truth[crop], interpolation="lanczos")
+    for setting, title in (("never", "colours alone"), ("measured", "background shows through")):
+        out = folder.with_name(f"{name}_240_transmission_{setting}")
+        told = ("--set", "container_masks=false", "--set", f"transmission={setting}")
+        made(out, "run", "splashsplat", str(folder), str(out), "--preset", "best", *told)
+        shown = Submission.open(out).rendering(view, t)
+        error = np.abs(shown.astype(float) - truth).mean(axis=2)
+        quality = 10 * np.log10(255**2 / np.square(shown.astype(float) - truth)[mask].mean())
+        bare(next(panels), title).imshow(shown[crop], interpolation="lanczos")
+        off = bare(next(panels), f"off by ({quality:.1f} dB)")
+        off.imshow(np.where(mask, error, 0)[crop], cmap="magma", vmin=0, vmax=30)
+    return [store(figure, "transmission.png", 110)]
+
+
 def perturbations() -> list[Path]:
     """A training view with each kind of perturbation at its fourth severity; masks as outlines."""
     folder = WORK / "opaque_bowl_recorded"
@@ -476,6 +499,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "standing": standing,
     "unmasked": unmasked,
     "rims": rims,
+    "transmission": transmission,
     "perturbations": perturbations,
     "tutorial": tutorial,
     "videos": videos,

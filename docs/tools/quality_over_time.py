@@ -39,6 +39,7 @@ class Times:
 #: By what stands behind `told_nothing` and `quality_over_time` in the names of results and table.
 TIMES = {
     "": Times((5, 7, 10, 14, 20, 30, 40, 60, 80, 120, 160, 220, 300), (10, 30, 60, 120, 300)),
+    "_transparent": Times((5, 7, 10, 14, 20, 30, 40, 60, 80, 120, 160, 220, 300), (10, 30, 60, 120, 300)),
     "_600x400": Times((10, 14, 20, 30, 40, 60, 80, 120, 160, 220, 300, 450, 600, 900), (30, 60, 120, 300, 600)),
 }
 METRICS = ("psnr", "lpips", "miou")

@@ -31,7 +31,7 @@ _SELF_CALIBRATION = 30.0
 # Bytes of a background anchor as it is stored, and the share of a byte budget for all of them.
 _ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25
 # Bytes of a carrier's values, about; a track that takes more than this much of its room is traced anew, coarser.
-_VALUE_BYTES, _TOO_LARGE = 4.5, 1.5
+_VALUE_BYTES, _TOO_LARGE = 3.9, 1.5
 # Share of the carriers that the fit leaves.
 _LEFT = 0.5
 # Traces of one scene, and cells along a side, at the least.

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.parallel import each
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 
@@ -43,19 +44,40 @@ def _of_view(scene: TrainingScene, plates: Plates, name: str, frames: NDArray[np
     radius = max(2, round(_MARGIN * max(plate.seen.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     behind = plate.floats()
-    texture = [np.diff(behind, axis=axis) for axis in (0, 1)]
-    together, alone, pairs = 0.0, 0.0, 0
-    for t in frames:
-        known = (cv2.erode(scene.mask(name, int(t)).astype(np.uint8), disc) > 0) & plate.seen
+
+    def found(t: np.int64) -> list[tuple[float, float, int]]:
+        """Along either axis: how the photograph's differences go with the plate's, the plate's squares, and pairs."""
+        mask = scene.mask(name, int(t))
+        if not mask.any():
+            return []
+        box = _around(mask, radius)
+        known = (cv2.erode(mask[box].astype(np.uint8), disc) > 0) & plate.seen[box]
         if not known.any():
-            continue
-        image = scene.image(name, int(t)) * np.float32(1 / 255)
-        for axis, there in enumerate(texture):
+            return []
+        image, plain = scene.image(name, int(t))[box] * np.float32(1 / 255), behind[box]
+        sums = []
+        for axis in (0, 1):
             both = known[1:] & known[:-1] if axis == 0 else known[:, 1:] & known[:, :-1]
-            wanted, shown = there[both].astype(np.float64), np.diff(image, axis=axis)[both]
-            together += float((wanted * shown).sum())
-            alone += float((wanted * wanted).sum())
-            pairs += len(wanted)
+            shown = np.diff(image, axis=axis)[both]
+            wanted = np.diff(plain, axis=axis)[both].astype(np.float64)
+            sums.append((float((wanted * shown).sum()), float((wanted * wanted).sum()), len(wanted)))
+        return sums
+
+    together, alone, pairs = 0.0, 0.0, 0
+    for sums in each(found, frames):
+        for product, squares, count in sums:
+            together += product
+            alone += squares
+            pairs += count
     if pairs < _LEAST * plate.seen.size or alone == 0:
         return None
     return together / alone
+
+
+def _around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
+    """Rows and columns of all that is true in `mask`, and `margin` more to each side."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
+        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
+    )

@@ -160,7 +160,12 @@ def quality_over_time(name: str) -> list[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "number", "times"), [("", 0, (10, 30, 60, 120, 300)), ("_600x400", 3, (30, 60, 120, 300, 600))]
+    ("name", "number", "times"),
+    [
+        ("", 0, (10, 30, 60, 120, 300)),
+        ("_transparent", 3, (10, 30, 60, 120, 300)),
+        ("_600x400", 5, (30, 60, 120, 300, 600)),
+    ],
 )
 def test_quality_over_time_is_that_of_the_committed_results(name: str, number: int, times: tuple[int, ...]) -> None:
     lines = quality_over_time(name)

@@ -195,8 +195,10 @@ class Decoder(nn.Module):
             instant = Instant(state.positions, state.deformation, state.phi, eye, state.visibility, *groups)
             means, factors, opacities, colors, offsets, terms = decode(self.heads(), *tables, instant, rows)
             # The kernel knows nothing of these: one more layer, and of transparent liquid alone.
-            own = features if rows is None else nn.functional.embedding(rows, features, sparse=True)
-            shown_through = self.transmittances(own)
+            shown_through = None
+            if self.settings.transmission:
+                own = features if rows is None else nn.functional.embedding(rows, features, sparse=True)
+                shown_through = self.transmittances(own)
             children = Children(means, factors, opacities, colors, offsets, shown_through)
             return children, None if terms is None else Penalties(*terms.unbind())
         if rows is not None:

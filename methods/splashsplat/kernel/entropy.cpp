@@ -28,6 +28,7 @@ constexpr int NODE_CONTEXTS = 7 * 3 * 3 * 3, BLOCK_CONTEXTS = 16;
 constexpr int BY_ROWS = 1, BY_ROWS_AND_COLUMNS = 2;
 
 struct Writer {
+    static constexpr bool READS = false;
     SplashCode& code;
 
     void shift() {
@@ -73,6 +74,7 @@ struct Writer {
 };
 
 struct Reader {
+    static constexpr bool READS = true;
     SplashCode& code;
 
     void refill() {
@@ -151,7 +153,7 @@ bool table_by(Coder coder, int32_t* table, int64_t rows, int32_t columns, int32_
             const int64_t context = (column * befores + size_of(before)) * besides + size_of(beside);
             const int64_t found = code_number(coder, zeros.data() + context * QUESTIONS, *at);
             if (!coder.sound() || found < -INT32_MAX || found > INT32_MAX) return false;
-            *at = static_cast<int32_t>(found);
+            if constexpr (Coder::READS) *at = static_cast<int32_t>(found);
         }
     }
     return true;
@@ -180,7 +182,7 @@ bool field_by(Coder coder, int16_t* field, const int64_t shape[5]) {
                         const int64_t context = (component * SIZES + differ) * SIZES + kind;
                         const int64_t found = code_number(coder, zeros.data() + context * QUESTIONS, *at - likely) + likely;
                         if (!coder.sound() || found < INT16_MIN || found > INT16_MAX) return false;
-                        *at = static_cast<int16_t>(found);
+                        if constexpr (Coder::READS) *at = static_cast<int16_t>(found);
                     }
     return true;
 }
@@ -225,7 +227,7 @@ bool node_by(Coder& coder, const Frame& frame, uint16_t* zeros, int64_t x, int64
     const int context = (kind * 9 + ends) * 3 + much;
     const int64_t found = code_number(coder, zeros + context * QUESTIONS, frame.now[node] - likely) + likely;
     if (!coder.sound() || found < frame.least || found > frame.most) return false;
-    frame.now[node] = static_cast<int8_t>(found);
+    if constexpr (Coder::READS) frame.now[node] = static_cast<int8_t>(found);
     return true;
 }
 

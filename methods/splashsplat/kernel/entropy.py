@@ -7,7 +7,7 @@ has all of it in words.
 
 Three kinds of numbers are coded: tables, whose rows may resemble the rows before; fields on a grid; and signed
 distances, which change near the surface alone. What is read from strangers raises ValueError where no writer gave it,
-and asks for no more memory than so few bytes can say.
+where so few bytes cannot be so much, and where it is more than any file of this project may hold.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ from .library import KERNEL
 
 # A sure answer costs a 92nd of a bit: so many numbers, or blocks, can a byte stand for at the most.
 _PER_BYTE = 8 * 92
+# Numbers of an array, at the most: 2 GiB of the longest ones, as much as an archive may unpack to. A code that is all
+# zeros is next to nothing in an archive.
+_MOST = 1 << 29
 _BLOCK = 4
 _LARGEST = np.iinfo(np.int32).max
 # Each column of a table has contexts of its own, some kilobytes of them.
@@ -190,3 +193,5 @@ def _require_code(code: NDArray[np.uint8], shape: Sequence[int]) -> None:
     numbers = math.prod(int(n) for n in shape)
     if min(shape, default=0) < 0 or numbers > _PER_BYTE * (len(code) + 8):
         raise ValueError(f"{len(code)} bytes cannot be {numbers} numbers")
+    if numbers > _MOST:
+        raise ValueError(f"{numbers} numbers are more than {_MOST}")

@@ -116,5 +116,5 @@ def fitting(path: Path, read: Callable[[], T]) -> T:
     """What `read` returns; SplashbenchError where the files at `path` do not fit together, or liquid.json."""
     try:
         return read()
-    except (IndexError, KeyError, OverflowError, RuntimeError, ValueError) as error:
+    except (IndexError, KeyError, MemoryError, OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise SplashbenchError(f"{path} does not fit liquid.json ({error}); {AGAIN}") from None

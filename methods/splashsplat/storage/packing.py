@@ -1,7 +1,7 @@
 """The arrays of a liquid's files as they are written: long ones of whole numbers as codes (kernel/entropy.py).
 
-A code takes a tenth to a third fewer bytes than the same numbers compressed by bzip2, and signed distances two thirds.
-Its shape is not in it: other arrays of the same file tell it, and liquid.json.
+A code takes a tenth to a third fewer bytes than the same numbers compressed by bzip2, and a fraction of its time. Its
+shape is not in it: other arrays of the same file tell it, and liquid.json.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.files import compressed_bytes
+from splashbench.files import MAX_NPZ_BYTES, compressed_bytes
 from splashbench.scene.geometry import MAX_STEPS
 
 from ..fields.sparse_frames import Frames, SparseFrames
 from ..kernel.entropy import Near, read_field, read_frames, read_table, write_field, write_frames, write_table
+from .rows import MAX_ROWS
 from .signed_distance import COARSER, FAR, packed_frame, whole_frame
 from .values import COEFFICIENTS, LEVELS
 
@@ -68,8 +69,10 @@ def unpack_distance(arrays: Mapping[str, np.ndarray], shape: tuple[int, ...]) ->
     least, most = (int(end) for end in _whole_numbers(arrays["ends"], 2))
     if not -FAR - 1 <= least <= 0 <= most <= MAX_STEPS // COARSER:
         raise ValueError(f"phi is from {least} to {most} steps, beyond 7.9 voxels")
-    if min(shape) < 0 or math.prod(shape[1:]) > _MOST_NODES:
-        raise ValueError(f"a frame of phi has {'x'.join(map(str, shape[1:]))} nodes, more than {_MOST_NODES}")
+    if min(shape[1:]) < 1 or math.prod(shape[1:]) > _MOST_NODES:
+        raise ValueError(f"a frame of phi has {'x'.join(map(str, shape[1:]))} nodes, none or more than {_MOST_NODES}")
+    if math.prod(shape) > MAX_NPZ_BYTES:
+        raise ValueError(f"{shape[0]} frames of phi are more than {MAX_NPZ_BYTES / 2**30:g} GiB")
     frames: Iterable[NDArray[np.int8]] = read_frames(arrays["phi"], shape, (least, most))
     nx, ny, nz = shape[1:]
     return SparseFrames((nx, ny, nz), (packed_frame(steps) for steps in frames))
@@ -97,22 +100,28 @@ def packed_bytes(arrays: Mapping[str, np.ndarray]) -> int:
 
 def unpack_carriers(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of carriers of which `pack` made these. Raises ValueError where they do not fit together."""
-    count = int(_whole_numbers(arrays["births"]).sum(dtype=np.int64))
+    births = _whole_numbers(arrays["births"]).astype(np.int64)
+    count = int(births.sum()) if births.min(initial=0) >= 0 else -1
     lives = read_table(arrays["lives"], (count, 1), NEAR["lives"])[:, 0]
     if count and int(lives.min()) < 1:
         raise ValueError("a carrier lasts for no frame")
     moves = int(lives.sum(dtype=np.int64)) - count
+    if count + moves > MAX_ROWS:
+        raise ValueError(f"{count + moves} rows are more than {MAX_ROWS}")
     return {
         **arrays,
+        "births": births.astype(np.uint32),
         "lives": lives,
         "cells": read_table(arrays["cells"], (count, 1), NEAR["cells"])[:, 0],
-        "residuals": read_table(arrays["residuals"], (moves, 3), NEAR["residuals"]),
+        "residuals": _short(read_table(arrays["residuals"], (moves, 3), NEAR["residuals"])),
     }
 
 
 def unpack_motion(arrays: Mapping[str, np.ndarray], steps: int) -> dict[str, np.ndarray]:
     """The same of a motion of so many `steps`."""
     nx, ny, nz = (int(n) for n in _whole_numbers(arrays[NODES], 3))
+    if min(nx, ny, nz) < 2:
+        raise ValueError(f"a motion on {nx} x {ny} x {nz} nodes; there are two along each axis at least")
     others = {name: array for name, array in arrays.items() if name != NODES}
     return others | {"velocities": read_field(arrays["velocities"], (steps, nx, ny, nz, 3))}
 
@@ -125,10 +134,16 @@ def unpack_appearance(arrays: Mapping[str, np.ndarray], count: int) -> dict[str,
     shares = np.bincount(coarseness, minlength=LEVELS)
     size = len(arrays["center"])
     coefficients = {
-        name: read_table(arrays[name], (int(shares[level]), size), NEAR[name]).T
+        name: _short(read_table(arrays[name], (int(shares[level]), size), NEAR[name])).T
         for level, name in ((level, f"{COEFFICIENTS}{level}") for level in range(LEVELS))
     }
     return {**arrays, "coarseness": coarseness.astype(np.uint8), **coefficients}
+
+
+def _short(numbers: NDArray[np.int32]) -> np.ndarray:
+    """The same in the smallest type that holds them: they stay in memory with the model."""
+    largest = max(int(numbers.max(initial=0)), -int(numbers.min(initial=0)))
+    return numbers.astype(np.min_scalar_type(-largest - 1))
 
 
 def _whole_numbers(array: np.ndarray, count: int | None = None) -> np.ndarray:

@@ -160,6 +160,8 @@ def test_more_than_so_few_bytes_can_say_is_refused_before_it_is_made() -> None:
         read_field(few, (2**20, 2**20, 2**20, 2**20, 3))
     with pytest.raises(ValueError, match="cannot be"):
         list(read_frames(few, (1, 2**20, 2**20, 2**20), (-13, 12)))
+    with pytest.raises(ValueError, match="numbers are more than"):
+        read_table(np.zeros(10**6, np.uint8), (2**29 + 1, 1), 0)  # which an archive of a hundred bytes may hold
     with pytest.raises(ValueError, match="columns"):
         read_table(np.zeros(1000, np.uint8), (1, 10_000), 0)
     for code in (np.zeros(40), np.zeros((4, 10), np.uint8), np.zeros(40, np.int8)):

@@ -180,12 +180,17 @@ def test_numbers_that_do_not_fit_together_are_named(
         ("carriers", lambda a: a | {"births": a["births"][:-1]}),
         ("carriers", lambda a: a | {"births": a["births"] + 0.5}),
         ("carriers", lambda a: a | {"births": a["births"].astype(np.int64) << 40}),
+        ("carriers", lambda a: a | {"births": -a["births"].astype(np.int64)}),
+        ("carriers", lambda a: a | {"births": a["births"].astype(np.uint64) << np.uint64(63)}),
+        ("carriers", lambda a: a | {"births": a["births"] * 10**6, "lives": np.zeros(2 * 10**6, np.uint8)}),
         ("carriers", lambda a: a | {"residuals": a["residuals"] + 0.5}),
         ("carriers", lambda a: a | {"lives": a["lives"].astype(np.int64)}),
         ("carriers", lambda a: a | {"cells": a["cells"][:-2]}),
         ("motion", lambda a: a | {"velocities": a["velocities"][:0]}),
         ("motion", lambda a: a | {"nodes": a["nodes"] * 1000}),
         ("motion", lambda a: a | {"nodes": -a["nodes"]}),
+        ("motion", lambda a: a | {"nodes": np.array([2**31 - 1, 2**20, 0])}),
+        ("motion", lambda a: a | {"nodes": np.array([9000, 200, 100]), "velocities": np.zeros(10**7, np.uint8)}),
         ("motion", lambda a: a | {"nodes": a["nodes"][:2]}),
         ("motion", lambda a: a | {"nodes": a["nodes"] + 0.5}),
         ("distance", lambda a: a | {"phi": a["phi"][:-1]}),
@@ -211,6 +216,12 @@ def test_arrays_that_do_not_fit_together_are_named(
         Liquid.load(tmp_path)
 
 
+def test_more_frames_than_a_file_may_hold_are_refused() -> None:
+    still = {"phi": np.zeros(10**6, np.uint8), "ends": np.array([-13, 12], np.int8)}
+    with pytest.raises(ValueError, match="frames of phi are more than 2 GiB"):
+        unpack_distance(still, (2**14, 64, 64, 64))
+
+
 def test_carriers_that_never_move_and_none_at_all_are_stored() -> None:
     for count in (0, 3):
         carriers = {
@@ -226,10 +237,13 @@ def test_carriers_that_never_move_and_none_at_all_are_stored() -> None:
             np.testing.assert_array_equal(found[name], array)
 
 
-def test_a_frame_larger_than_any_grid_is_refused(fitted: tuple[FittedSplashSplat, Run], tmp_path: Path) -> None:
+@pytest.mark.parametrize("shape", [[4096, 4096, 4096], [2**30, 2**30, 0], [0, 5, 5], [-4, -4, 8]])
+def test_frames_that_no_grid_has_are_refused(
+    shape: list[int], fitted: tuple[FittedSplashSplat, Run], tmp_path: Path
+) -> None:
     fitted[0].liquid.save(tmp_path)
     header = json.loads((tmp_path / "liquid.json").read_text())
-    header["grid"]["shape"] = [4096, 4096, 4096]
+    header["grid"]["shape"] = shape
     (tmp_path / "liquid.json").write_text(json.dumps(header))
     with pytest.raises(SplashbenchError, match=r"distance\.npz does not fit"):
         Liquid.load(tmp_path)
