@@ -390,6 +390,7 @@ CHARTS: dict[str, Callable[[], Figure]] = {
     "transport": transport,
     "told_nothing": told_nothing,
     "quality_over_time": quality_over_time,
+    "quality_over_time_transparent": partial(quality_over_time, "quality_over_time_transparent"),
     "quality_over_time_600x400": partial(quality_over_time, "quality_over_time_600x400"),
     "capacity": capacity,
     "whole_fit": whole_fit,
