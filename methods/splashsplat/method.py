@@ -31,12 +31,15 @@ from .draft import State
 from .fields.occlusion import LiquidOcclusion
 from .flip.solver import metric_gravity
 from .model import Liquid
+from .panorama import Panorama, panorama
 from .settings import VERSION, SplashSplatConfig
 
 if TYPE_CHECKING:
     from ..scaffold_gs import Background
 
 MIN_VIEWS = 2
+# Eyes of which it is known what they see behind the liquid, at the most.
+_EYES = 64
 
 
 class FittedSplashSplat(Fitted):
@@ -50,6 +53,8 @@ class FittedSplashSplat(Fitted):
         self._device, self._look = CPU, liquid.appearance
         self._background_image: tuple[Camera, np.ndarray] | None = None
         self._frozen: tuple[Camera, Frozen] | None = None
+        # What each eye sees behind all of the liquid: exports ask for the same ones at every time.
+        self._around: dict[tuple[float, ...], Panorama] = {}
 
     def to_device(self, device: str) -> None:
         """Decode and draw on `device` from now on; where carriers are, and what lies behind them, is the processor's
@@ -155,17 +160,27 @@ class FittedSplashSplat(Fitted):
     def gaussians(self, time: float, eye: np.ndarray) -> Gaussians:
         """The carriers' children, coloured as `eye` [3] sees them; what the container hides is among them.
 
-        Of transparent liquid each is as opaque as leaves the background its share, so that it shows the same over it.
+        Of transparent liquid the share of the background that is behind each is part of its colour.
         """
         carriers = self._carriers(time)
         if not carriers:
             return Gaussians.none()
         children = self._decoded(carriers, eye).to(CPU)
-        opacities = children.opacities
+        colors = children.colors
         if children.transmittances is not None:
-            opacities = opacities * (1 - children.transmittances)
-        parts = (children.means, children.factors, opacities, children.colors)
+            share = children.transmittances[..., None]
+            colors = (1 - share) * colors + share * self._behind(children.means, eye)
+        parts = (children.means, children.factors, children.opacities, colors)
         return Gaussians(*(part.flatten(0, 1).numpy() for part in parts))
+
+    def _behind(self, places: torch.Tensor, eye: np.ndarray) -> torch.Tensor:
+        """The background's colour [n, K, 3] that `eye` sees behind `places` [n, K, 3]."""
+        seen = tuple(float(value) for value in eye)
+        if seen not in self._around:
+            if len(self._around) >= _EYES:
+                self._around.clear()
+            self._around[seen] = panorama(self.background.render, eye, self.liquid.grid.corners())
+        return torch.from_numpy(self._around[seen].at(places.reshape(-1, 3).numpy())).reshape(places.shape)
 
     def static_gaussians(self, eye: np.ndarray) -> Gaussians:
         """The frozen background's, coloured as `eye` [3] sees them."""

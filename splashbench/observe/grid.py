@@ -53,6 +53,10 @@ class Grid:
         """Node coordinates [..., 3] to scene units [..., 3], float64."""
         return np.asarray(voxels, dtype=np.float64) * self.voxel + self.origin
 
+    def corners(self) -> np.ndarray:
+        """Positions of the outermost nodes, float64 [8, 3], scene units."""
+        return self.to_scene(np.array(list(np.ndindex(2, 2, 2))) * (np.array(self.shape) - 1))
+
     def nodes(self) -> np.ndarray:
         """Positions of all nodes, float64 [nx, ny, nz, 3], scene units."""
         axes = [self.origin[a] + self.voxel * np.arange(self.shape[a]) for a in range(3)]

@@ -63,7 +63,8 @@ def outcome(sample: Case, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     state = CarrierState(*[None if value is None else value.to(dtype) for value in vars(state).values()])
     cells = replace(cells, sizes=cells.sizes.to(dtype))
     children, penalties = decoder.decode(*tables, rows, state, eye.to(dtype), cells if len(rows) else None)
-    values = vars(children) | ({} if penalties is None else vars(penalties))
+    every = vars(children) | ({} if penalties is None else vars(penalties))
+    values = {name: value for name, value in every.items() if value is not None}
     generator = torch.Generator().manual_seed(7)
     loss = torch.zeros((), dtype=dtype)
     for name, value in values.items():

@@ -13,7 +13,7 @@ import torch
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json, write_json
 from splashbench.harness.contract import Run
-from splashbench.render import rasterize
+from splashbench.render import rasterize_arrays
 from splashbench.scene import Camera, Scene
 from splashbench_methods import scaffold_gs
 from splashbench_methods.splashsplat import FittedSplashSplat, SplashSplat, SplashSplatConfig, course
@@ -22,6 +22,7 @@ from splashbench_methods.splashsplat.appearance.decoder import Children, Decoder
 from splashbench_methods.splashsplat.appearance.glass import Splats
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState
 from splashbench_methods.splashsplat.model import Liquid
+from splashbench_methods.splashsplat.panorama import camera_towards, panorama
 from splashbench_methods.splashsplat.reconstruction import fit_liquid
 from splashbench_methods.splashsplat.trace import trace_liquid
 
@@ -186,24 +187,6 @@ def test_the_kernel_has_what_the_definition_has() -> None:
     assert not any(name.startswith("transmittance") for name in opaque.state_dict())
 
 
-def test_what_is_handed_out_shows_the_same_over_its_background() -> None:
-    """One Gaussian: behind others the background is not theirs to show."""
-    children = some_children(1, 5)
-    assert children.transmittances is not None
-    background = some_background()
-    image, _ = composite(children, CAMERA, background)
-    opacities = children.opacities * (1 - children.transmittances)
-    handed_out, _ = rasterize(
-        children.means[:, 0],
-        children.factors[:, 0],
-        opacities[:, 0],
-        children.colors[:, 0],
-        CAMERA,
-        background=background,
-    )
-    torch.testing.assert_close(image, handed_out, atol=4e-3, rtol=0)  # what is fainter than a grey level is not drawn
-
-
 def fitted(scene: Scene, behind: dict[str, np.ndarray], **settings: object) -> Liquid:
     config = SplashSplatConfig.preset("quick", TINY | settings)
     run, training = Run(seed=0), scene.training()
@@ -242,6 +225,70 @@ class _Flat:
         return self._image
 
 
+class _Grey:
+    """A background of one colour."""
+
+    def render(self, camera: Camera) -> np.ndarray:
+        return np.full((camera.height, camera.width, 3), 0.3, np.float32)
+
+
+class _Sky:
+    """A background whose colour is where it is looked to."""
+
+    def render(self, camera: Camera) -> np.ndarray:
+        rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+        rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.K).T @ camera.w2c[:3, :3]
+        return (0.5 + 0.5 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def test_what_is_handed_out_shows_the_same_from_where_it_was_asked_for(balls_copy: Path) -> None:
+    scene = recoloured(balls_copy, 0.6)
+    behind = {
+        name: BACKDROP[: camera.height, : camera.width].astype(np.float32) / 255
+        for name, camera in scene.cameras.items()
+    }
+    sky = _Sky()
+    model = FittedSplashSplat(fitted(scene, behind, iterations=60, transmission="always"), sky)
+    for name in (scene.train[0], scene.test[0]):
+        camera, time = scene.cameras[name], float(scene.times[4])
+        own = model.render(camera, time)
+        assert (own.alpha > 0.5).sum() > 30
+        given = model.gaussians(time, camera.center)
+        drawn, _ = rasterize_arrays(
+            given.means, given.factors, given.opacities, given.colors, camera, background=sky.render(camera)
+        )
+        assert np.abs(drawn - own.rgb).max() < 0.02
+        children = model.children(camera, time)
+        assert children is not None
+        assert children.transmittances is not None
+        assert float(children.transmittances.mean()) > 0.3  # without it this would be another test
+
+
+CORNERS = np.array([[x, y, z] for x in (-1.0, 2.0) for y in (0.0, 1.0) for z in (3.0, 4.0)])
+
+
+@pytest.mark.parametrize("eye", [(0, 0, -4), (9, 0.1, 3.5), (0, 30, 3.5), (0.5, 0.5, -40)])
+def test_a_panorama_has_all_of_the_box_in_it(eye: tuple[float, float, float]) -> None:
+    camera = camera_towards(np.array(eye, dtype=float), CORNERS)
+    np.testing.assert_allclose(camera.center, eye, atol=1e-9)
+    pixels, depths = camera.project(CORNERS)
+    assert (depths > 0).all()
+    assert (pixels >= 0).all()
+    assert (pixels <= camera.width).all()
+    assert np.ptp(pixels, axis=0).max() > 0.4 * camera.width
+    seen = panorama(_Sky().render, eye, CORNERS)
+    towards = CORNERS - eye
+    wanted = 0.5 + 0.5 * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    np.testing.assert_allclose(seen.at(CORNERS), wanted, atol=0.012)
+
+
+@pytest.mark.parametrize("eye", [(0.5, 0.5, 3.5), (0.4, 0.6, 3.2)])
+def test_an_eye_within_the_box_sees_some_color_everywhere(eye: tuple[float, float, float]) -> None:
+    found = panorama(_Sky().render, eye, CORNERS).at(CORNERS)
+    assert found.shape == (8, 3)
+    assert np.isfinite(found).all()
+
+
 def test_files_keep_it(balls_copy: Path, tmp_path: Path) -> None:
     scene = recoloured(balls_copy, 0.6)
     behind = {
@@ -253,16 +300,17 @@ def test_files_keep_it(balls_copy: Path, tmp_path: Path) -> None:
     assert read_json(tmp_path / "liquid.json")["decoder"]["transmission"] is True
     loaded = Liquid.load(tmp_path)
     camera, time = scene.cameras[scene.train[1]], float(scene.times[3])
-    background = _Flat(np.full((camera.height, camera.width, 3), 0.3, np.float32))
+    background = _Grey()
     images = [FittedSplashSplat(each, background).render(camera, time) for each in (liquid, loaded)]
     np.testing.assert_array_equal(images[0].rgb, images[1].rgb)
     gaussians = FittedSplashSplat(liquid, background).gaussians(time, camera.center)
     children = FittedSplashSplat(liquid, background).children(camera, time)
     assert children is not None
     assert children.transmittances is not None
-    np.testing.assert_allclose(
-        gaussians.opacities, (children.opacities * (1 - children.transmittances)).flatten().numpy(), rtol=1e-6
-    )
+    np.testing.assert_array_equal(gaussians.opacities, children.opacities.flatten().numpy())
+    share = children.transmittances[..., None]
+    colors = ((1 - share) * children.colors + share * 0.3).reshape(-1, 3)
+    np.testing.assert_allclose(gaussians.colors, colors, atol=0.51 / 255)
     # Without the weights that say by how much, and where no background is behind the liquid alone.
     header = read_json(tmp_path / "liquid.json")
     write_json(tmp_path / "liquid.json", header | {"composition": "together"})
