@@ -161,10 +161,7 @@ class Course:
 
     def _settle_transmission(self) -> None:
         """Whether Gaussians show what is behind them, from now on."""
-        if self._config.transmission != "measured":
-            return
-        if self._config.composition == "together":
-            self._config = _transmission_settled(self._config, 0.0)
+        if self._config.transmission != "measured" or self._config.composition == "together":
             return
         share = self._shows_through()
         self._config = _transmission_settled(self._config, share)

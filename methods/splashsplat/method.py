@@ -176,11 +176,14 @@ class FittedSplashSplat(Fitted):
     def _behind(self, places: torch.Tensor, eye: np.ndarray) -> torch.Tensor:
         """The background's colour [n, K, 3] that `eye` sees behind `places` [n, K, 3]."""
         seen = tuple(float(value) for value in eye)
-        if seen not in self._around:
+        # One look at the table: another thread may empty it meanwhile.
+        around = self._around.get(seen)
+        if around is None:
+            around = panorama(self.background.render, eye, self.liquid.grid.corners())
             if len(self._around) >= _EYES:
                 self._around.clear()
-            self._around[seen] = panorama(self.background.render, eye, self.liquid.grid.corners())
-        return torch.from_numpy(self._around[seen].at(places.reshape(-1, 3).numpy())).reshape(places.shape)
+            self._around[seen] = around
+        return torch.from_numpy(around.at(places.reshape(-1, 3).numpy())).reshape(places.shape)
 
     def static_gaussians(self, eye: np.ndarray) -> Gaussians:
         """The frozen background's, coloured as `eye` [3] sees them."""

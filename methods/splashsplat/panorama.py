@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splashbench.scene.camera import Camera
+from splashbench.scene.camera import Camera, look_at
 
 # Pixels along a side, and the widest angle (radians) to either side of the middle that is seen.
 _PIXELS, _WIDEST = 400, 1.2
@@ -41,14 +41,10 @@ def panorama(render: Callable[[Camera], ArrayLike], eye: ArrayLike, corners: NDA
 
 def camera_towards(eye: NDArray[np.float64], corners: NDArray[np.float64]) -> Camera:
     """A square view from `eye` [3] that has all `corners` [n, 3] in it, as far as a pinhole sees."""
-    towards = corners.mean(axis=0) - eye
-    distance = float(np.linalg.norm(towards))
-    forward = towards / distance if distance > 0 else np.array([0.0, 0.0, 1.0])
-    aside = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    right = aside / np.linalg.norm(aside)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
+    forward = corners.mean(axis=0) - eye
+    if not forward.any():
+        forward = np.array([0.0, 0.0, 1.0])
+    pose = look_at(eye, eye + forward, np.eye(3)[np.argmin(np.abs(forward))])
     local = corners @ pose[:3, :3].T + pose[:3, 3]
     angles = np.arctan2(np.abs(local[:, :2]).max(axis=1), local[:, 2])
     focal = 0.5 * _PIXELS / np.tan(min(float(angles.max()) + 0.01, _WIDEST))

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.observe.silhouettes import ImageWindow
 from splashbench.parallel import each
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
@@ -50,7 +51,7 @@ def _of_view(scene: TrainingScene, plates: Plates, name: str, frames: NDArray[np
         mask = scene.mask(name, int(t))
         if not mask.any():
             return []
-        box = _around(mask, radius)
+        box = ImageWindow.around(mask, radius).slices
         known = (cv2.erode(mask[box].astype(np.uint8), disc) > 0) & plate.seen[box]
         if not known.any():
             return []
@@ -72,12 +73,3 @@ def _of_view(scene: TrainingScene, plates: Plates, name: str, frames: NDArray[np
     if pairs < _LEAST * plate.seen.size or alone == 0:
         return None
     return together / alone
-
-
-def _around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of all that is true in `mask`, and `margin` more to each side."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return (
-        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
-        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
-    )

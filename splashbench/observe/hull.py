@@ -127,9 +127,7 @@ class _Carver:
         """By how many voxels at most a distance of up to LIMIT_VOXELS at a node of `grid` differs from that at the
         middle of its block; None where part of the grid is beside the camera or behind it."""
         camera, focal = self._camera, focal_length(self._camera)
-        last = np.array(grid.shape) - 1
-        corners = grid.to_scene(np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * last)
-        seen = corners @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
+        seen = grid.corners() @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
         nearest, farthest = float(seen[:, 2].min()), float(seen[:, 2].max())
         if nearest <= LIMIT_VOXELS * grid.voxel:
             return None
