@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from .settings import SplashSplatConfig
 
-# Of the draft: what a few seconds allow, and the share of them before its background.
-_DRAFT_ITERATIONS = 400
+# Of the draft: what a few seconds allow; by how much more where Gaussians show what is behind them, as these learn for
+# longer, and nothing else is shown for twenty seconds; and the share of the iterations before its background.
+_DRAFT_ITERATIONS, _TRANSMITTING_DRAFT = 400, 1.5
 _DRAFT_PLATES_SHARE = 0.25
 # How far beyond the surface carriers of opaque liquid are born, in voxels.
 _DRAFT_SHELL_OUTSIDE = 0.125
@@ -39,7 +40,7 @@ def draft_of(config: SplashSplatConfig, opaque: bool = False) -> SplashSplatConf
             "interior_per_cell": 1,
             "shell_depth": 3.0,
             "still_cell": 0.0,
-            "iterations": _DRAFT_ITERATIONS,
+            "iterations": round(_DRAFT_ITERATIONS * (_TRANSMITTING_DRAFT if config.transmission == "always" else 1)),
             "coarse_grids_share": 0.0,
             "validation_share": 0.0,
             "idle_share": 0.0,

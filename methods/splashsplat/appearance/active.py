@@ -61,17 +61,15 @@ class ActiveCarriers:
         self._cells = [_cells(track, t, color_cell) for t in frames]
         # Of each frame's carriers in the track those that are left; None for all.
         self._left: list[Tensor | None] = [None for _ in frames]
-        # By the target's identity: bool, which of its frame's carriers in the track make up some of it.
-        self._focus: dict[int, Tensor] = {}
+        # By the target's identity: its frame, and which of this one's carriers that are left make up some of it, int32.
+        self._focus: dict[int, tuple[int, Tensor]] = {}
 
     def of(self, target: TrainingTarget) -> Active:
         """What `target` teaches."""
         t = target.frame
         left = self._left[t]
-        places, visibility, taught = None, None, left
-        shown = self._shown(target)
-        if shown is not None:
-            places = chosen(shown, left).nonzero()[:, 0]
+        places, visibility, taught = self._places(target), None, left
+        if places is not None:
             taught = places if left is None else left.index_select(0, places)
         if target.hidden is not None:
             visibility = 1 - chosen(target.hidden, taught).to(torch.float32) / HIDDEN
@@ -84,11 +82,13 @@ class ActiveCarriers:
         in_front = None if target.in_front is None else chosen(target.in_front, taught)
         return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes), in_front)
 
-    def _shown(self, target: TrainingTarget) -> Tensor | None:
-        """bool, which carriers of the target's frame in the track it teaches; None for all."""
+    def _places(self, target: TrainingTarget) -> Tensor | None:
+        """int64, which of the target's frame's carriers that are left it teaches; None for all."""
         if id(target) in self._focus:
-            return self._focus[id(target)]
-        return None if target.hidden is None else target.hidden < HIDDEN
+            return self._focus[id(target)][1].to(torch.int64)
+        if target.hidden is None:
+            return None
+        return chosen(target.hidden < HIDDEN, self._left[target.frame]).nonzero()[:, 0]
 
     def focus(self, idle: Callable[[TrainingTarget, Active], Tensor], targets: Sequence[TrainingTarget]) -> None:
         """From now on each of `targets` teaches only those of its carriers that are not `idle` (bool, of the active
@@ -101,10 +101,7 @@ class ActiveCarriers:
             found[active.ids.numpy()] = True
             taught[chosen(active.ids, useful).numpy()] = True
             places = useful if active.places is None else chosen(active.places, useful)
-            left = self._left[target.frame]
-            in_frame = torch.zeros(len(self._track.ids(target.frame)), dtype=torch.bool)
-            in_frame[places if left is None else chosen(left, places)] = True
-            self._focus[id(target)] = in_frame
+            self._focus[id(target)] = target.frame, places.to(torch.int32)
         # Those of frames without any photograph are shown all the same: they look like their neighbours.
         self.drop(torch.from_numpy(found & ~taught))
 
@@ -117,13 +114,16 @@ class ActiveCarriers:
 
     def drop(self, idle: Tensor) -> None:
         """Leave out the carriers `idle` (bool [count]) from now on."""
-        self.ids = list(self.ids)
+        self.ids, kept = list(self.ids), [~idle.index_select(0, ids) for ids in self.ids]
         for t, ids in enumerate(self.ids):
-            left = (~idle.index_select(0, ids)).nonzero()[:, 0]
+            left = kept[t].nonzero()[:, 0]
             before = self._left[t]
             self._left[t] = left if before is None else before.index_select(0, left)
             self.ids[t] = ids.index_select(0, left)
             self._cells[t] = self._cells[t].index_select(0, left)
+        for target, (t, places) in self._focus.items():
+            still = places.masked_select(kept[t].index_select(0, places))
+            self._focus[target] = t, (kept[t].cumsum(0, dtype=torch.int32) - 1).index_select(0, still)
 
 
 def _cells(track: Track, t: int, size: float) -> Tensor:

@@ -110,7 +110,7 @@ class Track:
         """
         rows = self.carriers.rows(t)
         positions = _at(self.carriers.positions[rows], places)
-        deformation = _at(self.carriers.deformation[rows], places).astype(np.float32, copy=False)
+        deformation = _floats(self.carriers.deformation[rows], places)
         if fraction == 0 or len(positions) == 0:
             return positions, deformation
         return self.motion.step(t if fraction > 0 else t - 1).forecast(positions, deformation, fraction)
@@ -119,3 +119,11 @@ class Track:
 def _at(values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
     """The rows of `values` at `places`; all of them without."""
     return values if places is None else values.take(places, axis=0)
+
+
+def _floats(values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
+    """`_at` in single precision."""
+    rows = _at(values, places)
+    if places is None or rows.dtype != np.float16:
+        return rows.astype(np.float32, copy=False)
+    return torch.from_numpy(rows).to(torch.float32).numpy()  # numpy takes three times as long

@@ -173,6 +173,14 @@ def test_a_draft_does_not_wait_for_all_that_the_footage_tells_of_a_container(
     assert done == ["standing_roughly", "draft", "standing_about_liquid"]
 
 
+def test_a_draft_of_liquid_that_shows_what_is_behind_it_learns_longer() -> None:
+    iterations = {
+        transmission: smaller.draft_of(SplashSplatConfig(transmission=transmission)).iterations
+        for transmission in ("never", "always")
+    }
+    assert iterations["always"] > iterations["never"] > 0
+
+
 @pytest.fixture
 def parts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Which parts were begun, in their order, and after how many iterations since the part before."""
