@@ -6,6 +6,7 @@ carriers of the fine grids begin with (appearance/warm_start.py). They go on wit
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +24,12 @@ from .trace import trace_liquid
 
 # Share of it that the trace takes, for the progress bar only.
 _TRACE = 0.4
+# What is not shown of it where Gaussians show what is behind them, in photographs seen: in glass these states are up to
+# half a decibel below the draft.
+_BELOW_DRAFT = 0.35
+
+#: Is given what makes the reconstruction as it is, and whether there will be no other for a while.
+Offer = Callable[[Callable[[], Reconstruction], bool], None]
 
 
 def begins_on_coarse_grids(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> bool:
@@ -41,7 +48,7 @@ def fit_coarsely(
     known: KnownContainer | None,
     before: Sightings,
     behind: dict[str, np.ndarray],
-    offer: Callable[[Callable[[], Reconstruction], bool], None] | None,
+    offer: Offer | None,
     span: tuple[float, float],
 ) -> list[Learned]:
     """What the first iterations by `config` teach, on coarse grids, to be taken out of the list, as it is large. It is
@@ -53,8 +60,21 @@ def fit_coarsely(
     middle = span[0] + _TRACE * (span[1] - span[0])
     # What the observations say is noted by the fine ones.
     traced = trace_liquid(scene, coarse_of(config), run.aside((span[0], middle)), known, before)
+    if offer is not None and config.transmission == "always":
+        offer = _without_first(offer, round(_BELOW_DRAFT * len(scene.train) * scene.n_frames))
     learned: list[Learned] = []
     found = fit_liquid(scene, behind, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)
     if learned and offer is not None:
         offer(lambda: found, True)
     return learned
+
+
+def _without_first(offer: Offer, count: int) -> Offer:
+    """`offer` from its call number `count` on, but for states that are to stand."""
+    calls = itertools.count()
+
+    def later(found: Callable[[], Reconstruction], milestone: bool) -> None:
+        if next(calls) >= count or milestone:
+            offer(found, milestone)
+
+    return later

@@ -42,7 +42,7 @@ extern "C" int splash_runs(const char* variant) {
     return std::strcmp(variant, "baseline") == 0;
 }
 
-// The avx512 variant is there for those who ask for it: its gain has not been measured.
+// The avx512 variant is there for those who ask for it: fits take as long by it (docs/renderer.md).
 extern "C" const char* splash_best_variant(void) { return runs_x86_64_v3() ? "avx2" : "baseline"; }
 
 extern "C" const char* splash_variant(void) { return SPLASH_VARIANT; }

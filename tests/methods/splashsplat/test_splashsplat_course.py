@@ -16,7 +16,14 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Budget, Fitted, Run
 from splashbench.scene import Scene, TrainingScene
 from splashbench_methods import scaffold_gs
-from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course, reconstruction, smaller
+from splashbench_methods.splashsplat import (
+    SplashSplat,
+    SplashSplatConfig,
+    coarse_fit,
+    course,
+    reconstruction,
+    smaller,
+)
 from splashbench_methods.splashsplat.appearance import fitting
 from splashbench_methods.splashsplat.appearance.fitting import Fit
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget
@@ -292,6 +299,30 @@ def test_transparent_liquid_is_shown_before_the_background_first(
     assert coarse[1]
     # States on the way stop the clock, and with it what runs beside the background.
     assert offered == [cores == 1]
+
+
+def test_first_states_of_coarse_grids_are_left_out_where_gaussians_show_what_is_behind_them(
+    balls: Scene, short_background: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as they are below the draft. What stands for a while is always shown."""
+    ways: dict[str, list[bool]] = {}
+
+    def fit_liquid(*_: Any, offer: Any, keep: Any) -> None:
+        keep(Learned)
+        for _ in range(balls.n_frames * len(balls.train)):
+            offer(lambda: None, False)
+
+    monkeypatch.setattr(coarse_fit, "trace_liquid", lambda *_: None)
+    monkeypatch.setattr(coarse_fit, "fit_liquid", fit_liquid)
+    for transmission in ("never", "always"):
+        shown = ways.setdefault(transmission, [])
+        config = SplashSplatConfig(transmission=transmission)
+        offer = lambda _, milestone, shown=shown: shown.append(milestone)  # noqa: E731
+        coarse_fit.fit_coarsely(balls, config, Run(), None, [], {}, offer, (0, 1))
+    photographs = balls.n_frames * len(balls.train)
+    assert len(ways["never"]) == photographs + 1
+    assert len(ways["always"]) == photographs + 1 - round(coarse_fit._BELOW_DRAFT * photographs)
+    assert ways["always"][-1]
 
 
 def test_where_the_coarse_fit_learns_nothing_there_is_none(
