@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from .settings import SplashSplatConfig
 
-# Of the draft: what a few seconds allow; by how much more where Gaussians show what is behind them, as these learn for
-# longer, and nothing else is shown for twenty seconds; and the share of the iterations before its background.
-_DRAFT_ITERATIONS, _TRANSMITTING_DRAFT = 400, 1.5
-_DRAFT_PLATES_SHARE = 0.25
+# Of the draft: what a few seconds allow, the first ones before its background; and how many more where Gaussians show
+# what is behind them, as these learn for longer, and nothing else is shown for twenty seconds.
+_DRAFT_ITERATIONS, _DRAFT_BEFORE_BACKGROUND, _TRANSMITTING_DRAFT = 400, 0.25, 1.5
 # How far beyond the surface carriers of opaque liquid are born, in voxels.
 _DRAFT_SHELL_OUTSIDE = 0.125
 # And the edge of its hull voxels in pixels, and how few there are at least.
@@ -20,6 +19,7 @@ _COARSE_CELLS, _COARSE_PIXELS, _COARSE_PIXELS_CLEAR = 160, 1.8, 1.5
 def draft_of(config: SplashSplatConfig, opaque: bool = False) -> SplashSplatConfig:
     """Of the draft: coarse carriers of each frame alone, and few iterations. opaque: whether nothing is known to show
     through the liquid."""
+    longer = _TRANSMITTING_DRAFT if config.transmission == "always" else 1.0
     return config.model_copy(
         update={
             # So coarse a surface is off by a part of a voxel. Carriers beyond it make clear liquid too wide.
@@ -40,12 +40,12 @@ def draft_of(config: SplashSplatConfig, opaque: bool = False) -> SplashSplatConf
             "interior_per_cell": 1,
             "shell_depth": 3.0,
             "still_cell": 0.0,
-            "iterations": round(_DRAFT_ITERATIONS * (_TRANSMITTING_DRAFT if config.transmission == "always" else 1)),
+            "iterations": round(longer * _DRAFT_ITERATIONS),
             "coarse_grids_share": 0.0,
             "validation_share": 0.0,
             "idle_share": 0.0,
             "glass": 0,
-            "plates_share": _DRAFT_PLATES_SHARE,
+            "plates_share": _DRAFT_BEFORE_BACKGROUND / longer,
             # What it takes to measure what may be stored how coarsely is worth it for a fit that is kept.
             "storage_tolerance": 0.0,
         }
