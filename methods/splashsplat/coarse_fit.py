@@ -60,7 +60,7 @@ def fit_coarsely(
     middle = span[0] + _TRACE * (span[1] - span[0])
     # What the observations say is noted by the fine ones.
     traced = trace_liquid(scene, coarse_of(config), run.aside((span[0], middle)), known, before)
-    if offer is not None and config.transmission == "always":
+    if offer is not None and config.draft_cells > 0 and config.transmission == "always":
         offer = _without_first(offer, round(_BELOW_DRAFT * len(scene.train) * scene.n_frames))
     learned: list[Learned] = []
     found = fit_liquid(scene, behind, traced, run.aside((middle, span[1])), offer=offer, keep=learned.append)

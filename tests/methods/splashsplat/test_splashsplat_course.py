@@ -304,8 +304,8 @@ def test_transparent_liquid_is_shown_before_the_background_first(
 def test_first_states_of_coarse_grids_are_left_out_where_gaussians_show_what_is_behind_them(
     balls: Scene, short_background: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As long as they are below the draft. What stands for a while is always shown."""
-    ways: dict[str, list[bool]] = {}
+    """As long as they are below the draft, where there is one. What stands for a while is always shown."""
+    ways: dict[tuple[str, int], list[bool]] = {}
 
     def fit_liquid(*_: Any, offer: Any, keep: Any) -> None:
         keep(Learned)
@@ -314,15 +314,15 @@ def test_first_states_of_coarse_grids_are_left_out_where_gaussians_show_what_is_
 
     monkeypatch.setattr(coarse_fit, "trace_liquid", lambda *_: None)
     monkeypatch.setattr(coarse_fit, "fit_liquid", fit_liquid)
-    for transmission in ("never", "always"):
-        shown = ways.setdefault(transmission, [])
-        config = SplashSplatConfig(transmission=transmission)
+    for transmission, draft in (("never", 140), ("always", 140), ("always", 0)):
+        shown = ways.setdefault((transmission, draft), [])
+        config = SplashSplatConfig(transmission=transmission, draft_cells=draft)
         offer = lambda _, milestone, shown=shown: shown.append(milestone)  # noqa: E731
         coarse_fit.fit_coarsely(balls, config, Run(), None, [], {}, offer, (0, 1))
     photographs = balls.n_frames * len(balls.train)
-    assert len(ways["never"]) == photographs + 1
-    assert len(ways["always"]) == photographs + 1 - round(coarse_fit._BELOW_DRAFT * photographs)
-    assert ways["always"][-1]
+    assert len(ways["never", 140]) == len(ways["always", 0]) == photographs + 1
+    assert len(ways["always", 140]) == photographs + 1 - round(coarse_fit._BELOW_DRAFT * photographs)
+    assert ways["always", 140][-1]
 
 
 def test_where_the_coarse_fit_learns_nothing_there_is_none(
