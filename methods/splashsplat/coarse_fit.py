@@ -17,7 +17,7 @@ from splashbench.scene.scene import TrainingScene
 from .appearance.warm_start import Learned
 from .fields.container import KnownContainer
 from .fields.observations import Sightings
-from .reconstruction import Reconstruction, fit_liquid
+from .reconstruction import Offer, Reconstruction, fit_liquid
 from .settings import SplashSplatConfig
 from .smaller import coarse_of
 from .trace import trace_liquid
@@ -27,9 +27,6 @@ _TRACE = 0.4
 # What is not shown of it where Gaussians show what is behind them, in photographs seen: in glass these states are up to
 # half a decibel below the draft.
 _BELOW_DRAFT = 0.35
-
-#: Is given what makes the reconstruction as it is, and whether there will be no other for a while.
-Offer = Callable[[Callable[[], Reconstruction], bool], None]
 
 
 def begins_on_coarse_grids(scene: TrainingScene, config: SplashSplatConfig, run: Run) -> bool:

@@ -38,6 +38,8 @@ from .trace import Traced
 
 #: The liquid, and what hides it from cameras.
 Reconstruction = tuple[Liquid, LiquidOcclusion | None]
+#: Is given what makes it as it is on the way, and whether there will be no other for a while.
+Offer = Callable[[Callable[[], Reconstruction], bool], None]
 
 # Share of the seconds left for the appearance that storing it takes, and seconds beside.
 _STORING, _STORING_LEAST = 0.03, 1.0
@@ -60,7 +62,7 @@ def fit_liquid(
     run: Run,
     span: tuple[float, float] = (0.0, 1.0),
     frozen: Mapping[str, Frozen] | None = None,
-    offer: Callable[[Callable[[], Reconstruction], bool], None] | None = None,
+    offer: Offer | None = None,
     settled: Callable[[], Views] | None = None,
     room: Callable[[], int] | None = None,
     learned: list[Learned] | None = None,

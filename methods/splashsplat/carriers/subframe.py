@@ -124,6 +124,6 @@ def _at(values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
 def _floats(values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
     """`_at` in single precision."""
     rows = _at(values, places)
-    if places is None or rows.dtype != np.float16:
+    if places is None or rows.dtype != np.float16:  # all rows are the stored ones, which torch may not take: read-only
         return rows.astype(np.float32, copy=False)
     return torch.from_numpy(rows).to(torch.float32).numpy()  # numpy takes three times as long
