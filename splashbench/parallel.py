@@ -2,12 +2,14 @@
 
 The kernels release the GIL, so plain Python threads do. Numba's own parallel loops bring an OpenMP runtime that spins
 beside torch's and aborts the process when it is forked later. A kernel writes only what is its own part's, so results
-do not depend on the number of threads. A kernel must not start others: they would wait for the thread it holds.
+do not depend on the number of threads. What one of the threads calls itself stays on it: parts that it waited for would
+wait for a thread in their turn, and with all of them waiting none would ever begin.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -19,6 +21,8 @@ Value = TypeVar("Value")
 
 # More parts than threads, because the work along an axis of a grid is uneven.
 _PARTS_PER_THREAD = 4
+# `inside` is set on the threads of the pool.
+_here = threading.local()
 
 
 @lru_cache(maxsize=1)
@@ -34,7 +38,12 @@ def thread_count() -> int:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="splashbench")
+    return ThreadPoolExecutor(thread_count(), "splashbench", initializer=lambda: setattr(_here, "inside", True))
+
+
+def _alone() -> bool:
+    """Whether work stays on the calling thread."""
+    return thread_count() == 1 or getattr(_here, "inside", False)
 
 
 # Threads do not survive a fork; the child makes its own pool.
@@ -48,7 +57,7 @@ def over_range(kernel: Callable[..., None], count: int, *arguments: Any, smalles
     smallest: parts have at least this many elements, so that small loops stay on the calling thread.
     """
     parts = min(_PARTS_PER_THREAD * thread_count(), max(1, count // smallest))
-    if parts == 1 or thread_count() == 1:
+    if parts == 1 or _alone():
         kernel(*arguments, 0, count)
         return
     edges = [count * part // parts for part in range(parts + 1)]
@@ -59,6 +68,6 @@ def over_range(kernel: Callable[..., None], count: int, *arguments: Any, smalles
 
 def each(function: Callable[[Item], Value], items: Iterable[Item]) -> list[Value]:
     """[function(item) for item in items], on all threads; for functions that release the GIL most of their time."""
-    if thread_count() == 1:
+    if _alone():
         return [function(item) for item in items]
     return list(_pool().map(function, items))

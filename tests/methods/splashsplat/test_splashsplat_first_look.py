@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from splashbench import parallel
 from splashbench.errors import SplashbenchError
 from splashbench.files.images import read_image, write_png
 from splashbench.harness import side_by_side
@@ -16,13 +17,15 @@ from splashbench.scene import Scene
 from splashbench_methods import scaffold_gs
 from splashbench_methods.splashsplat import SplashSplat, SplashSplatConfig, course
 from splashbench_methods.splashsplat.appearance import fitting
+from splashbench_methods.splashsplat.appearance.coarse import with_smaller
 from splashbench_methods.splashsplat.appearance.decoder import Decoder, DecoderSettings
-from splashbench_methods.splashsplat.appearance.first_look import Look, photographed, take_on
+from splashbench_methods.splashsplat.appearance.first_look import FirstLook, Look, photographed, take_on
 from splashbench_methods.splashsplat.appearance.fitting import Appearance
 from splashbench_methods.splashsplat.appearance.photographs import read_now
 from splashbench_methods.splashsplat.appearance.projection import projected_extent
 from splashbench_methods.splashsplat.appearance.targets import TrainingTarget, collect_targets
 from splashbench_methods.splashsplat.carriers.subframe import CarrierState, Track
+from splashbench_methods.splashsplat.motion import advection
 from splashbench_methods.splashsplat.trace import trace_liquid
 
 # Nothing here asks how good the background is, which would take most of the time.
@@ -104,6 +107,27 @@ def test_where_carriers_lie_in_a_photograph_is_what_the_camera_says(taught: tupl
         np.testing.assert_allclose(projected_extent(camera, behind), expected, rtol=1e-9)
     assert projected_extent(camera, behind[depth <= 0]) is None
     assert projected_extent(camera, positions[:0]) is None
+
+
+@pytest.mark.usefixtures("no_hang")
+def test_photographs_between_two_frames_are_looked_at_on_several_threads(
+    balls: Scene, taught: tuple[Track, list[TrainingTarget]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Positions between frames are made in parts, by the threads that look: these must not wait for each other."""
+    track, _ = taught
+    training = balls.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+    targets = collect_targets(training, grey, track, "window", blocks=4)
+    last = balls.n_frames - 1
+    between = [replace(target, fraction=0.3) for target in targets if target.frame < last]
+    once = photographed(track, between)
+    monkeypatch.setattr(parallel, "thread_count", lambda: 2)
+    monkeypatch.setattr(advection, "_SMALL_LOOP", 1)
+    parallel._pool.cache_clear()
+    first = FirstLook(track)
+    with_smaller(between, grey, dict.fromkeys(grey), first)
+    parallel._pool.cache_clear()
+    np.testing.assert_array_equal(first.look().colors, once.colors)
 
 
 def test_without_a_photograph_carriers_are_grey(taught: tuple[Track, list[TrainingTarget]]) -> None:
