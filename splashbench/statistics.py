@@ -60,10 +60,12 @@ class Estimate:
 def resampled(by_scene: Sequence[NDArray[np.float64]], samples: int = SAMPLES) -> NDArray[np.float64]:
     """[samples, n]: stratified resamplings of runs, scenes with replacement, then seeds within each; NaN fills up.
 
-    by_scene: per scene the values of its runs.
+    by_scene: per scene the values of its runs, [runs], or several of each that stay together, [runs, values].
     """
-    runs = np.append(np.concatenate(list(by_scene)), np.nan)
-    return np.asarray(runs[_draws(tuple(len(scene) for scene in by_scene), samples)])
+    runs = np.concatenate(list(by_scene))
+    runs = np.concatenate([runs, np.full_like(runs[:1], np.nan)])
+    drawn = runs[_draws(tuple(len(scene) for scene in by_scene), samples)]
+    return np.asarray(drawn.reshape(samples, -1))
 
 
 @lru_cache(maxsize=8)
@@ -84,10 +86,14 @@ def _draws(sizes: tuple[int, ...], samples: int) -> NDArray[np.int32]:
 def estimate(
     by_scene: Sequence[NDArray[np.float64]], statistic: Statistic = interquartile_mean, samples: int = SAMPLES
 ) -> Estimate:
-    """`statistic` of all runs together, and its 95% percentile interval over stratified resamplings."""
+    """`statistic` of all runs together, and its 95% percentile interval over stratified resamplings.
+
+    by_scene: as for `resampled`. Of runs with several values NaN is one that a run does not have.
+    """
     runs = np.concatenate(list(by_scene))
-    value = float(statistic(runs))
-    if len(runs) < LEAST_RUNS or not np.isfinite(runs).all():
+    value = float(statistic(runs.ravel()))
+    known = np.isfinite(runs) if runs.ndim == 1 else np.isfinite(runs).any(axis=1)
+    if len(runs) < LEAST_RUNS or not known.all():
         return Estimate(value)
     low, high = np.percentile(statistic(resampled(by_scene, samples)), [50 - _LEVEL / 2, 50 + _LEVEL / 2])
     return Estimate(value, (float(low), float(high)))

@@ -238,7 +238,11 @@ class Liquid:
             box = header["grid"]
             nx, ny, nz = (int(n) for n in box["shape"])
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
+            if not (grid.origin.shape == (3,) and np.isfinite(grid.origin).all() and 0 < grid.voxel < np.inf):
+                raise ValueError("the grid's origin is not three numbers, or its voxel not above 0")
             times = np.array(header["times"], dtype=np.float64)
+            if not (times.ndim == 1 and len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
+                raise ValueError("its times are not finite and rising")
             factor, carried = _factor(header["factor"]), bool(header["carried"])
             # Models of before there was a choice do not say.
             between: BetweenFrames = "forward" if header.get("between_frames") == "forward" else "both"
@@ -248,6 +252,8 @@ class Liquid:
             )
             if not isinstance(settings.transmission, bool) or (settings.transmission and composition == "together"):
                 raise ValueError("its transmission is not that of liquid over a background")
+            if not np.isfinite([value for value in vars(settings).values() if isinstance(value, (int, float))]).all():
+                raise ValueError("the decoder has numbers that are not finite")
             if not 1 <= max(settings.feature_size, settings.children, settings.color_width) <= _WIDEST:
                 raise ValueError(f"the decoder's sizes are not between 1 and {_WIDEST}")
             decoder = Decoder(settings)

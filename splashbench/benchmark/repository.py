@@ -203,7 +203,7 @@ def result_fault(result: Result, benchmark: Benchmark) -> str:
         return f"is of the scene {one_line(result.scene)[:60]!r}, which {BENCHMARK_FILE} does not name; remove it"
     if all(scene.digest not in (None, result.digests.scene) for scene in of_name):
         return f"is of another {result.scene} than the benchmark's (other files); run the method on that"
-    if result.digests.protocol != PROTOCOL_V1.digest:
+    if result.protocol != PROTOCOL_V1 or result.digests.protocol != PROTOCOL_V1.digest:
         return f"was scored by another protocol than {PROTOCOL_V1.label}; score the submission again"
     return ""
 

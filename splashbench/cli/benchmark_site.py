@@ -146,13 +146,14 @@ def site(arguments: argparse.Namespace) -> int:
     from splashbench.benchmark.repository import find_repeats, read_benchmark, read_entries
     from splashbench.benchmark.site import entry_lines, front_page, site_facts
     from splashbench.errors import SplashbenchError
-    from splashbench.files import files_together, require_folder_place, write_json, write_text
+    from splashbench.files import files_together, require_folder_place, require_unsealed_place, write_json, write_text
 
     if arguments.lpips_weights and not arguments.scenes:
         arguments.usage_error("--lpips-weights is for --scenes; add it")
     out: Path = arguments.out
     benchmark = read_benchmark(arguments.folder)
     require_folder_place(out)
+    require_unsealed_place(out)
     if out.is_dir() and any(out.iterdir()) and not (out / _SITE_FILE).is_file():
         raise SplashbenchError(f"{out} holds files that are no site's; give a new or an empty folder")
     entries = read_entries(arguments.folder, benchmark, with_scenes=bool(arguments.scenes))

@@ -61,7 +61,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench leaderboard`."""
-    from splashbench.files import files_together, write_text
+    from splashbench.files import files_together, require_unsealed_place, write_text
     from splashbench.report.changes import changes, shortened
     from splashbench.report.charts import speed_accuracy_chart
     from splashbench.report.leaderboard import write_leaderboard
@@ -69,6 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.report.results import read_results
     from splashbench.report.table import leaderboard_table, to_csv
 
+    require_unsealed_place(arguments.out)
     reading = read_results(arguments.results, _verifier(arguments))
     sources, left_out = reading.sources, reading.left_out
     table = leaderboard_table(sources)

@@ -76,11 +76,12 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def compare(arguments: argparse.Namespace) -> int:
     """Handle `splashbench masks compare`."""
-    from splashbench.files import files_together, require_folder_place
+    from splashbench.files import files_together, require_folder_place, require_unsealed_place
     from splashbench.prepare.masks.comparison import change_rows, compare_folders
 
     if arguments.out is not None:
         require_folder_place(arguments.out)
+        require_unsealed_place(arguments.out)
         _require_apart(arguments.out, (arguments.raw, arguments.refined))
     comparisons = list(compare_folders(arguments.raw, arguments.refined))
     rows = change_rows(comparisons)

@@ -70,7 +70,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench score`."""
-    from splashbench.files import require_file_place, require_folder_place
+    from splashbench.files import require_folder_place, require_picture_place
     from splashbench.report.result_sheet import write_result_sheet
     from splashbench.scene import Scene
     from splashbench.score import score_submission, shared_fields
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_folder_place(arguments.out)
     require_outside(arguments.out, *sealed)
     if arguments.sheet:
-        require_file_place(arguments.sheet)
+        require_picture_place(arguments.sheet, arguments.scene)
         require_outside(arguments.sheet, *sealed)
     scene = Scene.open(arguments.scene)
     # All are opened, hence verified, first: scoring may take hours.

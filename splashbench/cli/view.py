@@ -94,7 +94,9 @@ def run(arguments: argparse.Namespace) -> int:
         if output is not None:
             require_outside(output, *sealed)
     if arguments.screenshot:
-        _require_picture_place(arguments.screenshot)
+        from splashbench.files import require_picture_place
+
+        require_picture_place(arguments.screenshot, *arguments.places)
     if arguments.save_to:
         from splashbench.files import require_folder_place
 
@@ -159,14 +161,6 @@ def _identity_of(place: Path) -> str | None:
         return Submission.open(place, verify=False).identity.method
     except SplashbenchError:
         return None
-
-
-def _require_picture_place(path: Path) -> None:
-    from splashbench.files import require_file_place
-
-    if path.suffix.lower() != ".png":
-        raise SplashbenchError(f"{path} would be written as PNG; end its name in .png")
-    require_file_place(path)
 
 
 def _screenshot(viewer: Viewer, arguments: argparse.Namespace) -> int:

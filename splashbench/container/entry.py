@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from splashbench.container.verification import Projection, overlay
 from splashbench.errors import SplashbenchError
-from splashbench.files import files_together, require_file_place, require_folder_place, write_model
+from splashbench.files import files_together, require_folder_place, write_model
 from splashbench.scene import Camera, Scene
 from splashbench.scene.container import ContainerMesh
 from splashbench.scene.container_masks import require_same_pose
@@ -89,15 +89,6 @@ def write_entry(
 def name_in_scene(mesh: Path) -> str:
     """What the mesh's file is called in a scene's folder."""
     return f"container{mesh.suffix.lower()}"
-
-
-def require_picture(path: Path | None) -> None:
-    """Raise SplashbenchError, before long work, unless a picture can take the place `path`."""
-    if path is None:
-        return
-    if path.suffix.lower() != ".png":
-        raise SplashbenchError(f"{path}: the picture is a PNG; give a name that ends in .png")
-    require_file_place(path)
 
 
 def picture(scene: Scene, mesh: ContainerMesh, pose: ArrayLike, width: int = 640) -> NDArray[np.uint8]:

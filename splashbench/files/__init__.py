@@ -39,7 +39,12 @@ from splashbench.files.images import (
     write_image,
     write_png,
 )
-from splashbench.files.places import require_file_place, require_folder_place
+from splashbench.files.places import (
+    require_file_place,
+    require_folder_place,
+    require_picture_place,
+    require_unsealed_place,
+)
 from splashbench.files.plain import MAX_FILE_BYTES, is_plain_file, open_plain, read_plain, require_plain_file
 
 __all__ = [
@@ -74,8 +79,10 @@ __all__ = [
     "remove_any",
     "require_file_place",
     "require_folder_place",
+    "require_picture_place",
     "require_plain_file",
     "require_png",
+    "require_unsealed_place",
     "sha256_file",
     "tree_bytes",
     "validate_model",

@@ -7,6 +7,9 @@ from pathlib import Path
 
 from splashbench.errors import SplashbenchError
 
+#: Files that a submission has, and nothing else.
+_SEALED = ("submission.toml", "SHA256SUMS")
+
 
 def require_file_place(path: Path, replace: bool = True) -> None:
     """Raise SplashbenchError where no file can be written at `path`; called before long work.
@@ -21,6 +24,28 @@ def require_file_place(path: Path, replace: bool = True) -> None:
     if not replace and os.path.lexists(path):
         raise taken(path)
     require_folder_place(path.parent)
+
+
+def require_picture_place(path: Path, *folders: Path) -> None:
+    """Raise SplashbenchError, before long work, unless a PNG can take the place `path`.
+
+    folders: of what is read; files in them are not replaced.
+    """
+    require_file_place(path)
+    if Path(path).suffix.lower() != ".png":
+        raise SplashbenchError(f"{path}: the picture is a PNG; give a name that ends in .png")
+    for folder in folders:
+        if Path(path).exists() and Path(path).resolve().is_relative_to(Path(folder).resolve()):
+            raise SplashbenchError(f"{path} is a file of {folder}, which is read, and stays; give another place")
+    require_unsealed_place(path)
+
+
+def require_unsealed_place(path: Path) -> None:
+    """Raise SplashbenchError where `path` lies in a submission: a file that is added there breaks its seal."""
+    place = Path(path).resolve()
+    for folder in (place, *place.parents):
+        if all((folder / name).is_file() for name in _SEALED):
+            raise SplashbenchError(f"{path} lies in {folder}, whose files are sealed; give a place outside it")
 
 
 def taken(path: Path) -> SplashbenchError:

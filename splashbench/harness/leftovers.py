@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from splashbench.errors import SplashbenchError
 from splashbench.files import is_staged_for
 
 #: The file that marks a folder of a run under way.
@@ -65,6 +66,26 @@ def clear_leftovers(out: Path) -> list[str]:
             shutil.rmtree(path, ignore_errors=True)
             lines.append(f"removed {path}, left from a run that was killed")
     return lines
+
+
+def require_alone(out: Path) -> None:
+    """Raise SplashbenchError where another run is writing `out`: one of the two would be thrown away at its end."""
+    out = Path(out).resolve()
+    for path in out.parent.glob(".tmp-*") if out.parent.is_dir() else ():
+        if is_staged_for(path, out) and _is_held(path):
+            raise SplashbenchError(f"another run is writing {out} now; wait for its end, or give another place")
+
+
+def _is_held(folder: Path) -> bool:
+    """Whether a run under way holds the mark of `folder`; False where nothing can tell."""
+    try:
+        with (folder / MARK).open("r+", encoding="utf-8") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def _is_own_folder(path: Path) -> bool:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from splashbench.files import atomic_directory
+from splashbench.files import atomic_directory, write_model
 from splashbench.harness import hardware
 from splashbench.progress import track
 from splashbench.scene import Scene, SignedDistance
 from splashbench.submission import IDENTITY, Identity, Record, Submission, seal, write_view
-from splashbench.submission.cameras import write_cameras
+from splashbench.submission.cameras import CAMERAS, scene_views
 from splashbench.submission.scene_files import write_scene_files
 from splashbench.version import __version__
 
@@ -55,7 +55,7 @@ def write_oracle(
             hardware=hardware.describe(),
         )
         count = float(particles.active.sum(axis=1).mean()) if particles is not None else None
-        write_cameras(staging, scene)
+        write_model(staging / CAMERAS, scene_views(scene))
         write_scene_files(staging, scene)
         seal(staging, identity, Record(particles_per_frame=count))
     return Submission.open(out)

@@ -13,12 +13,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_directory, remove_any
+from splashbench.files import atomic_directory, remove_any, write_model
 from splashbench.harness import estimates, hardware
 from splashbench.harness.contract import Method
 from splashbench.harness.devices import chosen_device
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
-from splashbench.harness.leftovers import clear_leftovers, held, scratch_folder
+from splashbench.harness.leftovers import clear_leftovers, held, require_alone, scratch_folder
 from splashbench.harness.messages import Request
 from splashbench.harness.phases import run_phases
 from splashbench.harness.training_copy import make_training_copy
@@ -32,7 +32,7 @@ from splashbench.submission import (
     identity_text,
     seal,
 )
-from splashbench.submission.cameras import write_cameras
+from splashbench.submission.cameras import CAMERAS, scene_views
 from splashbench.submission.scene_files import write_scene_files
 from splashbench.submission.withheld import Withheld, kept_timesteps, scored_timesteps
 from splashbench.version import __version__
@@ -117,7 +117,9 @@ def run_method(
         withheld=withheld,
     )
     kept = kept_timesteps(scene.n_frames, withheld)
-    for line in (*clear_leftovers(out), estimates.estimate(identity, scene, kept)):
+    views = scene_views(scene, kept)
+    require_alone(out)
+    for line in (unmasked_line(scene), *clear_leftovers(out), estimates.estimate(identity, scene, kept)):
         if line:
             tell(line)
     with (
@@ -152,7 +154,7 @@ def run_method(
             )
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, method.id)
-        write_cameras(staging, scene, kept)
+        write_model(staging / CAMERAS, views)
         if record.status == Status.OK:
             write_scene_files(staging, scene)
         seal(staging, identity, record)
@@ -193,6 +195,17 @@ def _identity(method: Method, **run: Any) -> Identity:
     except TypeError as error:
         raise SplashbenchError(f"method {method.id!r}: TOML cannot say its settings ({error}); change them") from None
     return identity
+
+
+def unmasked_line(scene: Scene) -> str:
+    """A warning where test views have no masks, which scoring needs; empty where all have some."""
+    without = ", ".join(name for name in scene.test if name in scene.unmasked)
+    if not without:
+        return ""
+    return (
+        f"note: test views {without} have no masks, so that this run cannot be scored. Put masks into "
+        f"{scene.directory / 'seg'} first: with them it is another scene, on which the method has to run again"
+    )
 
 
 def require_unchanged(scene: Scene, method: str) -> None:

@@ -33,7 +33,6 @@ QUALITY = ("psnr", "lpips", "miou")
 BUDGETS = (10.0, 60.0, 300.0)
 #: Entries of a group that have curves and are compared two by two.
 MAX_DRAWN = 30
-_REFERENCE = "nothing"
 _PER_OCTAVE = 4
 #: Ideal and reference of the hypervolume's dimensions: minutes of fit, LPIPS, megabytes (docs/protocol.md).
 IDEAL, WORST = (1.0, 0.04, 1.0), (240.0, 0.20, 1000.0)
@@ -61,11 +60,10 @@ def trajectories(group: Group, entry: Entry, name: str) -> dict[tuple[str, int],
 def before(group: Group, name: str) -> dict[str, float]:
     """What the control `nothing` has of metric `name`, by the scene's digest: the mean of its runs."""
     values: dict[str, list[float]] = {}
-    for entry in group.controls:
-        for result in entry.results:
-            value = result.value(name)
-            if result.method == _REFERENCE and value is not None:
-                values.setdefault(result.digests.scene, []).append(value)
+    for result in group.backgrounds:
+        value = result.value(name)
+        if value is not None:
+            values.setdefault(result.digests.scene, []).append(value)
     return {scene: float(np.mean(found)) for scene, found in values.items()}
 
 

@@ -6,14 +6,16 @@ Figures of two groups never share a chart or a mean: they would compare machines
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from splashbench.errors import one_line
 from splashbench.report.results import ResultFile
 from splashbench.score.result import Result
 
+#: The control that shows a scene without liquid.
+NOTHING = "nothing"
 _MAX_TOLD = 300
 # Different sets of scenes whose intersections `comparable` tries; the work grows with their square.
 _MAX_SETS = 40
@@ -39,13 +41,18 @@ class Entry:
 
 @dataclass
 class Group:
-    """What was measured on one machine by one protocol with scenes that told the same; told: None where not noted."""
+    """What was measured on one machine by one protocol with scenes that told the same; told: None where not noted.
+
+    backgrounds: results of the control `nothing` on the group's scenes, by its protocol; those of other machines where
+    it was not run on this one, since what it shows hardly depends on the machine, and it needs no GPU.
+    """
 
     machine: str
     protocol: str
     told: tuple[str, ...] | None
     entries: list[Entry] = field(default_factory=list)
     controls: list[Entry] = field(default_factory=list)
+    backgrounds: list[Result] = field(default_factory=list)
 
     @property
     def scenes(self) -> dict[str, str]:
@@ -76,14 +83,21 @@ def told_text(told: tuple[str, ...] | None) -> str:
 def groups(sources: Sequence[ResultFile]) -> list[Group]:
     """All results, by group and entry, in one order. Nothing is left out: failed runs stand with the others."""
     by_key: dict[tuple[str, str, str], list[Result]] = defaultdict(list)
+    backgrounds: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for source in sources:
         result = source.result
         by_key[result.hardware_label, result.protocol_label, told_text(result.told)].append(result)
-    return [_group(results) for _, results in sorted(by_key.items())]
+        if result.method == NOTHING and result.status == "ok":
+            backgrounds[result.digests.scene, result.protocol_label].append(result)
+    return [_group(results, backgrounds) for _, results in sorted(by_key.items())]
 
 
-def _group(results: list[Result]) -> Group:
+def _group(results: list[Result], backgrounds: Mapping[tuple[str, str], list[Result]]) -> Group:
     group = Group(results[0].hardware_label, results[0].protocol_label, results[0].told)
+    for scene in sorted({result.digests.scene for result in results}):
+        found = backgrounds.get((scene, group.protocol), [])
+        own = [result for result in found if result.hardware_label == group.machine]
+        group.backgrounds += own or found
     names = labels(results)
     entries: dict[tuple[str, str, str], Entry] = {}
     for result in sorted(results, key=lambda r: (r.scene, r.digests.scene, r.seed, r.digests.submission)):
@@ -138,4 +152,4 @@ def comparable(group: Group) -> Group:
         Entry(entry.label, [result for result in entry.results if result.digests.scene in chosen])
         for entry in group.controls
     ]
-    return Group(group.machine, group.protocol, group.told, kept, [entry for entry in controls if entry.results])
+    return replace(group, entries=kept, controls=[entry for entry in controls if entry.results])

@@ -9,7 +9,7 @@ from pathlib import Path
 from splashbench.errors import SplashbenchError
 from splashbench.score.metrics import METRICS
 from splashbench.score.result import Result
-from splashbench.score.verification import Difference, Verification, differences
+from splashbench.score.verification import Difference, Verification, contradictions
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def _one_each(sources: Iterable[ResultFile], left_out: list[LeftOut]) -> list[Re
         for source in same[1:]:
             if source.verification is None or source.verification.result is None:  # else both were computed here
                 contradicted = contradicted or next(
-                    ((source, different) for different in differences(first.result, source.result)), None
+                    ((source, different) for different in contradictions(first.result, source.result)), None
                 )
         if contradicted is not None:
             other, different = contradicted
@@ -178,8 +178,10 @@ def claimed_text(name: str, verifications: Iterable[Verification | None]) -> str
     return f" (claimed {', '.join(dict.fromkeys(stated))})" if stated else ""
 
 
-def _figure_count(result: Result) -> int:
-    return sum(result.value(name) is not None for name in METRICS)
+def _figure_count(result: Result) -> tuple[int, int, bool]:
+    """How much a result says: figures, then states on the way, then whether it notes what the scene told."""
+    figures = sum(result.value(name) is not None for name in METRICS)
+    return figures, len(result.checkpoints), result.told is not None
 
 
 def _order(result: Result) -> tuple[str, str, str, int]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from splashbench.report.groups import Group, groups
+from splashbench.report.groups import Group, comparable, groups
 from splashbench.report.results import ResultFile
 from splashbench.score.result import Result
 from splashbench.statistics import Estimate, estimate
@@ -30,11 +30,22 @@ class Dot:
 
 @dataclass
 class ChartedMethod:
-    """A method with its settings on one machine. mixed: see docs/protocol.md, "Mixed methods"."""
+    """A method with its settings on one machine. mixed: see docs/protocol.md, "Mixed methods".
+
+    shared: the scenes that means are over, common to all methods that compare; None: those that it ran on, which are
+    others. failed: runs without a figure.
+    """
 
     label: str
     mixed: bool = False
     dots: list[Dot] = field(default_factory=list)
+    shared: frozenset[str] | None = None
+    failed: int = 0
+
+    @property
+    def compares(self) -> bool:
+        """Whether its mean may stand on a front: over the same scenes as others', with no run left out."""
+        return self.shared is not None and not self.failed
 
     @property
     def scenes(self) -> set[str]:
@@ -49,7 +60,7 @@ class ChartedMethod:
         """Inter-quartile mean of time and of metric `name` over the runs that have it."""
         by_scene: dict[str, list[Dot]] = defaultdict(list)
         for dot in self.dots:
-            if name in dot.values:
+            if name in dot.values and (self.shared is None or dot.scene in self.shared):
                 by_scene[dot.scene].append(dot)
         if not by_scene:
             return None
@@ -114,18 +125,25 @@ def machines(sources: Sequence[ResultFile]) -> list[Machine]:
 
 def _machine(group: Group) -> Machine:
     scenes = len(group.scenes)
+    comparing = comparable(group)
+    kept = {entry.label for entry in comparing.entries}
+    shared = frozenset().union(*(entry.scenes for entry in comparing.entries))
     told = "" if group.told is None else f", told {group.told_text}"
     machine = Machine(
         f"{group.machine} · {scenes} scene{'' if scenes == 1 else 's'}, protocol {group.protocol}{told}", scenes
     )
+    if kept and len(shared) < scenes:
+        machine.title += f" · means over the {len(shared)} that methods have in common"
     for entry in group.entries:
-        charted = ChartedMethod(entry.label, entry.first.mixed)
+        charted = ChartedMethod(entry.label, entry.first.mixed, shared=shared if entry.label in kept else None)
         for result in entry.results:
             seconds = result.value("fit_seconds")
             if result.status != "ok":
                 machine.failures[f"{result.method}: {result.status}"] += 1
+                charted.failed += 1
             elif not seconds or seconds <= 0:
                 machine.failures[f"{result.method}: fit time not measured"] += 1
+                charted.failed += 1
             else:
                 memory = result.value("peak_device_memory_bytes") or result.value("peak_memory_bytes")
                 charted.dots.append(Dot(seconds, _shown_values(result), memory, result.digests.scene))
@@ -162,6 +180,8 @@ def reported_machine() -> Machine:
         values = {name: value for name in ("psnr", "lpips") if isinstance(value := row[name], float)}
         memory = row["memory_gib"]
         bytes_ = memory * 2**30 if isinstance(memory, float) else None
-        machine.entries.append(ChartedMethod(str(row["method"]), dots=[Dot(minutes * 60, values, bytes_)]))
+        machine.entries.append(
+            ChartedMethod(str(row["method"]), dots=[Dot(minutes * 60, values, bytes_)], shared=frozenset([""]))
+        )
         machine.title = f"{row['hardware']} by the paper · means over {row['scene_set']}"
     return machine

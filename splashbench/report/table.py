@@ -52,6 +52,7 @@ def leaderboard_table(sources: Sequence[ResultFile]) -> pd.DataFrame:
     Columns: those of the CSV, with figures as floats and NaN for none; every metric has its spread, NaN for one run.
     `failed` says whether a row is a failed run, and `results` holds the row's results in the order of their seeds.
     `verified` and `stated_otherwise` say in words what scoring the submissions again gave; "" where nobody asked.
+    `truths` is the number of different truths that a row was scored against; more than one has no figures of them.
     """
     runs = pd.DataFrame([{**_run(source.result), "verification": source.verification} for source in sources])
     names = list(METRICS)
@@ -68,12 +69,15 @@ def leaderboard_table(sources: Sequence[ResultFile]) -> pd.DataFrame:
                     runs=("seed", "size"),
                     results=("result", list),
                     verifications=("verification", list),
+                    truths=("truth", "nunique"),
                 ),
                 figures.median(),
                 (figures.max() - figures.min()).where(figures.count() > 1).add_suffix("_spread"),
             ]
         )
     )
+    against_truth = [name + end for name in TRUTH_METRICS for end in ("", "_spread")]
+    rows.loc[rows["truths"] > 1, against_truth] = float("nan")
     rows["verified"] = rows["verifications"].map(_verdict)
     rows["stated_otherwise"] = rows["verifications"].map(_stated_otherwise)
     ranking = [*SCENE_COLUMNS, "failed", "lpips", "psnr", *METHOD_COLUMNS, "told", "failed_submission"]
@@ -101,6 +105,7 @@ def _run(result: Result) -> dict[str, Any]:
         "method_version": result.method_version,
         "seed": result.seed,
         "submission": result.digests.submission,
+        "truth": result.digests.truth,
         "result": result,
         **{name: result.value(name) for name in METRICS},
     }

@@ -24,6 +24,7 @@ _COST = ("fit_seconds", "render_fps", "peak_memory_bytes", "storage_bytes")
 _NOT_RANKED = ("sigma_d", "mu_d")
 #: Claims of one run, and lines of a list, at most; the rest is counted.
 _MAX_CLAIMS, _MAX_LINES = 20, 500
+_TWO_TRUTHS = "seeds were scored against different true particles; score them again with one truth/"
 
 
 def to_markdown(
@@ -174,8 +175,10 @@ def _means(table: pd.DataFrame, letters: dict[str, str]) -> list[str]:
 
 def _mean_table(rows: pd.DataFrame, n_scenes: int, letters: dict[str, str]) -> str:
     names = [name for name in (*_QUALITY, "fit_seconds") if rows[name].notna().any()]
-    groups = rows.groupby(METHOD_COLUMNS)
-    scored = rows["scene_digest"].where(~rows["failed"]).groupby([rows[c] for c in METHOD_COLUMNS]).nunique()
+    # A row is of one scene here; what scenes told is never mixed, as in groups.py.
+    columns = [*METHOD_COLUMNS, "told"]
+    groups = rows.groupby(columns)
+    scored = rows["scene_digest"].where(~rows["failed"]).groupby([rows[c] for c in columns]).nunique()
     complete = (scored == n_scenes) & ~groups["failed"].any()
     # A figure that one scene lacks has no mean.
     has_all = groups[names].count().eq(groups.size(), axis=0)
@@ -184,8 +187,9 @@ def _mean_table(rows: pd.DataFrame, n_scenes: int, letters: dict[str, str]) -> s
     return _table(
         {
             "Method": _methods(methods),
-            "Preset": methods["preset"].map(escaped),
+            "Preset": _presets(methods),
             "Scenes": [f"{count} of {n_scenes}" for count in scored],
+            **({"Told": methods["told"].map(escaped)} if methods["told"].nunique() > 1 else {}),
         },
         {
             name: [
@@ -226,14 +230,18 @@ def _missing(table: pd.DataFrame) -> list[str]:
     """Why a figure is missing; costs, and a truth that no real scene has, need no saying."""
     methods: dict[tuple[str, str], set[str]] = defaultdict(set)
     for row in table[~table["failed"]].itertuples():
-        first = row.results[0]
-        expected = [name for name, metric in METRICS.items() if metric.group != "cost"]
-        if first.digests.truth is None:
-            expected = [name for name in expected if name not in TRUTH_METRICS]
-        for name in expected:
-            metric = first.metrics.get(name)
-            if metric is not None and metric.value is None:
-                methods[name, escaped(metric.reason or "")].add(escaped(row.method))
+        # A median over the seeds that have a figure stands in the table, and nothing there says so.
+        in_part = {name for name in METRICS if any(result.value(name) is not None for result in row.results)}
+        for result in row.results:
+            expected = [name for name, metric in METRICS.items() if metric.group != "cost"]
+            if result.digests.truth is None:
+                expected = [name for name in expected if name not in TRUTH_METRICS]
+            lacking = [name for name in expected if (m := result.metrics.get(name)) is not None and m.value is None]
+            for name in lacking:
+                by = f"{row.method}, seed {result.seed} on {row.scene}" if name in in_part else row.method
+                methods[name, escaped(result.metrics[name].reason or "")].add(escaped(by))
+        if row.truths > 1:
+            methods["figures against true particles", _TWO_TRUTHS].add(f"{escaped(row.method)} on {escaped(row.scene)}")
     lines = sorted(f"{name}: {reason} ({_few(sorted(by))})" for (name, reason), by in methods.items())
     return ["## Why a figure is missing", bullets(_bounded(lines))] if lines else []
 

@@ -11,6 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# Of entries that are 0 or 1 in every pinhole camera.
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -38,6 +41,10 @@ class Camera:
             raise ValueError(f"camera {self.name}: K or w2c has entries that are not finite")
         if self.width < 1 or self.height < 1 or self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise ValueError(f"camera {self.name}: image size and focal lengths must be positive")
+        if np.abs([self.K[1, 0], self.K[2, 0], self.K[2, 1], self.K[2, 2] - 1]).max() > _ROUNDING:
+            raise ValueError(f"camera {self.name}: K is not that of a pinhole (fx s cx, 0 fy cy, 0 0 1)")
+        if np.abs(self.w2c[3] - [0, 0, 0, 1]).max() > _ROUNDING:
+            raise ValueError(f"camera {self.name}: w2c does not end in 0 0 0 1; it may be transposed")
         rotation = self.w2c[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise ValueError(f"camera {self.name}: w2c does not hold a rotation")

@@ -20,6 +20,7 @@ from splashbench.files import image_size, read_gray, read_npz, sha256_file
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh, mesh_path, read_mesh
 from splashbench.scene.kept_pictures import KeptPictures
+from splashbench.scene.layout import LARGEST
 from splashbench.scene.neurofluid import NeuroFluidSource, is_neurofluid
 from splashbench.scene.particles import Particles
 from splashbench.scene.source import ReleasedSource, SceneSource
@@ -30,6 +31,10 @@ Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.bool_])
 NOMINAL_STEP_SECONDS = 1 / 30
 # Of the static points, unpacked: 19 million in double precision.
 _MAX_POINTS_BYTES = 1 << 30
+# Of points' colours, which are in [0, 1] but for what a fit of them overshoots.
+_MOST_COLOUR = 2.0
+# Cameras' own times lie within a recording's duration of the timesteps', and within this of those of a short one.
+_LEAST_REACH_SECONDS = 1.0
 
 
 class Scene:
@@ -115,6 +120,13 @@ class Scene:
                     f"{self.directory / 'scene.json'}: {key} names camera {unknown[0]}, which the scene does not have; "
                     "fix the entry"
                 )
+        reach = max(float(self.times[-1] - self.times[0]), _LEAST_REACH_SECONDS)
+        for name, times in camera_times.items():
+            if times and (times[0] < self.times[0] - reach or times[-1] > self.times[-1] + reach):
+                raise SplashbenchError(
+                    f"{self.directory / 'scene.json'}: camera_times of {name} are {times[0]:g} to {times[-1]:g}, and "
+                    f"times {self.times[0]:g} to {self.times[-1]:g}; give both in seconds of one clock"
+                )
         self.camera_times = {
             name: self._checked_times(f"camera_times of {name}", camera_times[name])
             if name in camera_times
@@ -193,7 +205,13 @@ class Scene:
         if data.shape[1] < 6:
             raise SplashbenchError(f"{path}: data has {data.shape[1]} columns, not x y z r g b seg; write it again")
         segment = data[:, 6:7] if data.shape[1] > 6 else np.zeros((len(data), 1))
-        return np.concatenate([data[:, :6], segment], axis=1).astype(np.float32)
+        with np.errstate(over="ignore"):
+            points = np.concatenate([data[:, :6], segment], axis=1).astype(np.float32)
+        if not np.abs(points[:, :3]).max(initial=0.0) <= LARGEST:
+            raise SplashbenchError(f"{path}: points lie beyond {LARGEST:g} scene units; write it again")
+        if not np.abs(points[:, 3:6]).max(initial=0.0) <= _MOST_COLOUR:
+            raise SplashbenchError(f"{path}: r, g, b are not in [0, 1]; divide them by 255 where they are 0 to 255")
+        return points
 
     @property
     def stated(self) -> tuple[str, ...]:

@@ -71,7 +71,7 @@ class CheckpointScore(_Frozen):
     seconds: float = Field(ge=0, allow_inf_nan=False)
     status: str = "ok"
     reason: str = ""
-    storage_bytes: int | None = Field(default=None, ge=0)
+    storage_bytes: int | None = Field(default=None, ge=0, le=int(MOST))
     metrics: dict[str, _Figure | None] = Field(default_factory=dict)
 
 
@@ -183,6 +183,8 @@ class Result(_Frozen):
         yield from self._name_faults()
         if self.status not in _STATUSES:
             yield f"status is {_short(self.status)!r}, which no run has ({', '.join(sorted(_STATUSES))})"
+        if self.digests.protocol != self.protocol.digest:
+            yield "digests.protocol is not that of its protocol"
         if len(self.claimed) > MAX_CLAIMS:
             yield f"claimed has {len(self.claimed)} figures, more than {MAX_CLAIMS}"
         for name, metric in self.metrics.items():

@@ -124,6 +124,19 @@ class Evidence:
         return None
 
 
+def contradictions(first: Result, second: Result) -> Iterator[Difference]:
+    """What two results of one submission both state and cannot both be right about, in whichever order.
+
+    An older one lacks what was not noted then, and one that was scored without weights or truth lacks their figures.
+    """
+    lacks = {name for name in METRICS if first.value(name) is None or second.value(name) is None}
+    if first.told is None or second.told is None:
+        lacks.add("told")
+    if not first.checkpoints or not second.checkpoints:
+        lacks.add("checkpoints")
+    yield from (different for different in differences(first, second) if different.name not in lacks)
+
+
 def differences(stated: Result, verified: Result) -> Iterator[Difference]:
     """What `stated` says otherwise than `verified`: names of the run, the scene's bytes, and figures both have."""
     for name in _NAMES:

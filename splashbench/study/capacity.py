@@ -149,8 +149,9 @@ def curves(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
     Besides: psnr_std, standard deviation of psnr over seeds, dB; runs, how many there are; ok, how many came through.
     A scene's figures are means over the seeds that came through. Those of `MEAN` are means over seeds of means over
-    scenes, of seeds that have the figure on every scene: one over the easier scenes would flatter. Means of costs are
-    geometric, since a cost counts by its doublings.
+    scenes, of seeds that have the figure on every scene: one over the easier scenes would flatter. Where some seed has
+    a PSNR on every rung that has any, rungs are over such seeds alone: from one rung to the next the settings are to
+    differ, and not the seeds. Means of costs are geometric, since a cost counts by its doublings.
     """
     found = {str(scene): _curve(rows, 1) for scene, rows in frame.groupby("scene", sort=False)}
     if len(found) > 1:
@@ -165,6 +166,10 @@ def _curve(frame: pd.DataFrame, n_scenes: int) -> pd.DataFrame:
     values[logarithmic] = np.log(values[logarithmic].where(values[logarithmic] > 0))
     groups = values.groupby(["rung", "seed"])[names]
     by_seed = groups.mean().where(groups.count() == n_scenes)
+    psnr = by_seed["psnr"].unstack("seed").dropna(how="all")
+    everywhere = psnr.columns[psnr.notna().all()]
+    if len(everywhere):
+        by_seed = by_seed[by_seed.index.get_level_values("seed").isin(everywhere)]
     by_rung = by_seed.groupby("rung")
     means = by_rung.mean()
     means[logarithmic] = np.exp(means[logarithmic])

@@ -101,6 +101,9 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
     Raises SplashbenchError where `out` holds other files, where another study runs in it, and for a full disk.
     """
     store, options = Store(out), replace(options, lpips_weights=_weights(options))
+    for planned in plan.scenes:
+        if store.out.resolve().is_relative_to(planned.scene.directory.resolve()):
+            raise SplashbenchError(f"{out} lies in the scene {planned.scene.directory}; give a place outside it")
     with claimed(store):
         selected = [run for run in plan.runs if options.only is None or run.variant.name in options.only]
         with_lpips = "lpips" in plan.spec.metrics and load_lpips(options.lpips_weights)[0] is not None

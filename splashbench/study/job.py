@@ -11,9 +11,9 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from splashbench.errors import DiskFullError, SplashbenchError, one_line
 from splashbench.files import read_model, write_model, write_png
@@ -33,6 +33,16 @@ _ROOM_BYTES = 16 << 20
 ERROR = "error"
 
 
+def _plain(name: str) -> str:
+    """`name` where it names a file in a folder and nothing else: a study's folder may be a stranger's."""
+    if name in ("", ".", "..") or any(letter in "/\\" or not letter.isprintable() for letter in name):
+        raise ValueError("is no plain name of a file")
+    return name
+
+
+_Name = Annotated[str, AfterValidator(_plain)]
+
+
 class Job(BaseModel):
     """What the process of a run is given: the planned run with all its paths, absolute ones.
 
@@ -42,8 +52,8 @@ class Job(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid")
-    digest: str
-    title: str
+    digest: _Name
+    title: _Name
     scene: str
     scene_digest: str
     variant: StudyVariant
@@ -79,12 +89,12 @@ class RunEntry(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     schema_version: int = 1
-    digest: str
+    digest: _Name
     title: str
     status: str
     reason: str = ""
-    result: str | None = None
-    faded: str | None = None
+    result: _Name | None = None
+    faded: _Name | None = None
     record: Record | None = None
     train_views: list[str] = Field(default_factory=list)
     training: TrainingScore | None = None

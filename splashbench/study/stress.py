@@ -15,6 +15,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.harness.discovery import load_method
 from splashbench.harness.runner import parse_overrides
 from splashbench.scene import Scene
+from splashbench.score import Result
 from splashbench.study.job import Store
 from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
 from splashbench.study.plan import StudyPlan, make_plan
@@ -130,7 +131,8 @@ def make_stress_plan(
 def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[StressRun], dict[tuple[str, int], float]]:
     """The runs that were made, with their `metric`; and the control's values by scene and seed.
 
-    Runs that were not made yet are in neither. Raises SplashbenchError where the control failed on a scene.
+    Runs that were not made yet are in neither, and neither are those that were scored without weights for `metric`.
+    Raises SplashbenchError where the control failed on a scene.
     """
     found: list[StressRun] = []
     nothing: dict[tuple[str, int], float] = {}
@@ -139,6 +141,8 @@ def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[Str
         if entry is None:
             continue
         run = StudyRun(planned, entry, store.result(entry))
+        if lacks_weights(run.result, metric):
+            continue
         label, harm = stress.rows[planned.variant.name]
         value = run.value(metric)
         if label == NOTHING:
@@ -154,6 +158,11 @@ def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[Str
     whole = {(run.method, run.scene, run.seed) for run in found if run.level == 0}
     complete = [run for run in found if (run.method, run.scene, run.seed) in whole and (run.scene, run.seed) in nothing]
     return complete, nothing
+
+
+def lacks_weights(result: Result | None, metric: str) -> bool:
+    """Whether a run that came through has no `metric` as it was scored without the network's weights: no failure."""
+    return result is not None and result.status == "ok" and metric == "lpips" and result.digests.lpips_weights is None
 
 
 def higher_is_better(metric: str) -> bool:

@@ -20,7 +20,7 @@ from splashbench.files import atomic_path, write_text
 from splashbench.markdown import table as markdown_table
 from splashbench.scene import Scene
 from splashbench.study.job import Store, pictured_timestep
-from splashbench.study.stability import BROKEN, StressRun
+from splashbench.study.stability import BROKEN, Breakdown, StressRun
 from splashbench.study.stress import Harm, StressPlan
 
 # Rows of a picture, and the width of one of its views in pixels.
@@ -30,36 +30,46 @@ _MARGIN = 0.12  # of the liquid's box, about it
 
 @dataclass(frozen=True)
 class KindSummary:
-    """What a method keeps under one kind: by level the mean retention of its runs, and how many there are of them."""
+    """What a method keeps under one kind: by level the mean retention of its runs, and how many there are of them.
+
+    breaks_at: the first of these levels at which the curve of `found` is below BROKEN; None where it never is.
+    """
 
     kind: str
     kept: Mapping[int, float]
     runs: int
     failed: int
-
-    @property
-    def breaks_at(self) -> int | None:
-        """The first level at which it breaks."""
-        return next((level for level, kept in sorted(self.kept.items()) if kept < BROKEN), None)
+    found: Breakdown
+    breaks_at: int | None
 
 
-def summaries(found: Mapping[StressRun, float]) -> list[KindSummary]:
-    """Of one method's retentions each kind, those first that break it the soonest, then those that cost it the most."""
+def summaries(found: Mapping[StressRun, float], breakdowns: Mapping[str, Breakdown]) -> list[KindSummary]:
+    """Of one method's retentions each kind, those first that break it the soonest, then those that cost it the most.
+
+    breakdowns: by kind, of the levels that were run.
+    """
     kinds: dict[str, dict[int, list[float]]] = {}
     failed: dict[str, int] = {}
-    for run, kept in found.items():
-        kinds.setdefault(run.kind, {}).setdefault(run.level, []).append(kept)
+    for run, value in found.items():
+        kinds.setdefault(run.kind, {}).setdefault(run.level, []).append(value)
         failed[run.kind] = failed.get(run.kind, 0) + (run.value is None)
-    rows = [
-        KindSummary(
-            kind,
-            {level: float(np.mean(values)) for level, values in sorted(levels.items())},
-            sum(map(len, levels.values())),
-            failed[kind],
-        )
-        for kind, levels in kinds.items()
-    ]
+    rows = []
+    for kind, levels in kinds.items():
+        kept = {level: float(np.mean(values)) for level, values in sorted(levels.items())}
+        curve = zip(kept, breakdowns[kind].fitted[1:], strict=True)
+        broken = next((level for level, of_curve in curve if of_curve < BROKEN), None)
+        runs = sum(map(len, levels.values()))
+        rows.append(KindSummary(kind, kept, runs, failed[kind], breakdowns[kind], broken))
     return sorted(rows, key=lambda row: (row.breaks_at or 6, min(row.kept.values())))
+
+
+def place(found: Breakdown) -> str:
+    """Where a method breaks, in the unit of the kind, with the interval where there is one."""
+    least = f"{found.amounts[-1]:g}"
+    if found.point is None:
+        return f"not up to {least}"
+    low, high = (least if end is None else f"{end:.3g}" for end in found.interval)
+    return f"{found.point:.3g}" + ("" if found.interval == (None, None) else f" ({low} to {high})")
 
 
 def page_name(label: str, number: int) -> str:
@@ -69,18 +79,24 @@ def page_name(label: str, number: int) -> str:
 
 
 def write_pages(
-    stress: StressPlan, store: Store, by_method: Mapping[str, Mapping[StressRun, float]], metric: str, out: Path
+    stress: StressPlan,
+    store: Store,
+    by_method: Mapping[str, Mapping[StressRun, float]],
+    breakdowns: Mapping[tuple[str, str], Breakdown],
+    metric: str,
+    out: Path,
 ) -> list[str]:
     """Write the page of every method of `by_method` into `out`, with its picture; returns the names of the files.
 
-    by_method: retentions by `metric`.
+    by_method: retentions by `metric`. breakdowns: of the same by method and kind.
     """
     names = []
     for number, label in enumerate(stress.methods):
         found = by_method.get(label)
         if not found:
             continue
-        rows, name = summaries(found), page_name(label, number)
+        of_label = {kind: where for (method, kind), where in breakdowns.items() if method == label}
+        rows, name = summaries(found, of_label), page_name(label, number)
         picture = _picture(stress, store, label, rows)
         if picture is not None:
             with atomic_path(out / f"{name}.png") as temporary:
@@ -99,7 +115,7 @@ def _page(stress: StressPlan, label: str, rows: Sequence[KindSummary], metric: s
     first = f", first under `{broken[0].kind}`" if broken else ""
     parts = [
         f"# Where {label} breaks",
-        f"**{said}{first}.** It breaks where it keeps less than {BROKEN:g} of its gain.",
+        f"**{said}{first}.** It breaks where the curve of what it keeps falls below {BROKEN:g}.",
     ]
     if picture is not None:
         parts.append(f"![The true view, the method's, and its view of a worse recording]({picture})")
@@ -108,7 +124,7 @@ def _page(stress: StressPlan, label: str, rows: Sequence[KindSummary], metric: s
         )
     cells = {
         "kind": [f"`{row.kind}`" for row in rows],
-        "breaks at": [_place(row, kinds[row.kind].ladder, kinds[row.kind].unit) for row in rows],
+        "breaks at": [f"{place(row.found)} {kinds[row.kind].unit}" for row in rows],
         **{
             f"severity {level}": [f"{row.kept[level]:.2f}" if level in row.kept else "–" for row in rows]
             for level in levels
@@ -118,7 +134,8 @@ def _page(stress: StressPlan, label: str, rows: Sequence[KindSummary], metric: s
     right = [name for name in cells if name.startswith("severity") or name == "failed"]
     parts += [f"## What it keeps, by {metric}", markdown_table(cells, right=right)]
     parts.append(
-        "Means over scenes and seeds; – was not run. Severities are those of each kind's ladder (docs/study.md)."
+        "Means of the runs; – was not run. Severities are those of each kind's ladder (docs/study.md). The curve never "
+        "rises, so that luck at one severity breaks nothing."
     )
     if broken:
         advice = {
@@ -127,13 +144,6 @@ def _page(stress: StressPlan, label: str, rows: Sequence[KindSummary], metric: s
         }
         parts += ["## What to do about it", markdown_table(advice)]
     return "\n\n".join(parts) + "\n"
-
-
-def _place(row: KindSummary, ladder: Sequence[float], unit: str) -> str:
-    if row.breaks_at is None:
-        return f"not up to {ladder[max(row.kept) - 1]:g} {unit}"
-    sooner = any(level not in row.kept for level in range(1, row.breaks_at))
-    return f"{ladder[row.breaks_at - 1]:g} {unit}" + (", or sooner" if sooner else "")
 
 
 def _picture(stress: StressPlan, store: Store, label: str, rows: Sequence[KindSummary]) -> NDArray[np.uint8] | None:

@@ -14,8 +14,8 @@ from splashbench.files import files_together, write_text
 from splashbench.markdown import bullets, escaped, one_line
 from splashbench.markdown import table as markdown_table
 from splashbench.score import Result
-from splashbench.score.notation import FILTER_MARK, FILTER_NOTE
-from splashbench.statistics import Estimate
+from splashbench.score.notation import FILTER_MARK, FILTER_NOTE, NO_FIGURE
+from splashbench.statistics import LEAST_RUNS, Estimate
 from splashbench.study.chart import save_figure
 from splashbench.study.job import Store
 from splashbench.study.report import frame_csv
@@ -29,8 +29,8 @@ from splashbench.study.stability import (
     retentions,
     stability,
 )
-from splashbench.study.stress import METRICS, Harm, StressPlan, higher_is_better, stress_runs
-from splashbench.study.stress_pages import write_pages
+from splashbench.study.stress import METRICS, Harm, StressPlan, higher_is_better, lacks_weights, stress_runs
+from splashbench.study.stress_pages import place, write_pages
 from splashbench.study.table_markdown import scenes_and_machines
 
 if TYPE_CHECKING:
@@ -96,7 +96,10 @@ def write_stress_report(stress: StressPlan, store: Store, out: Path, command: st
         names = ["stability.md", "stability.csv", "breakdown.csv", "retention.csv"]
         if findings and findings[0].breakdowns:
             names += [path.name for path in _draw(stress, findings[0], staging)]
-        pages = write_pages(stress, store, findings[0].retentions, findings[0].metric, staging) if findings else []
+        pages = []
+        if findings:
+            first = findings[0]
+            pages = write_pages(stress, store, first.retentions, first.breakdowns, first.metric, staging)
         text = _markdown(stress, store, findings, command, "retention.png" in names, pages)
         write_text(staging / "stability.md", text)
     return [Path(out, name) for name in [*names, *pages]]
@@ -134,9 +137,10 @@ def _amounts(harms: Sequence[Harm]) -> dict[str, list[float]]:
 
 
 def _stability_frame(findings: Sequence[Finding]) -> pd.DataFrame:
-    columns = ["method", "metric", "S", "S_low", "S_high", "CVaR10", "CVaR10_low", "CVaR10_high", "runs", "failed"]
+    figures = ["S", "S_low", "S_high", "CVaR10", "CVaR10_low", "CVaR10_high", "resampled"]
+    columns = ["method", "metric", *figures, "runs", "failed"]
     rows = [
-        [label, finding.metric, *_three(found.score), *_three(found.worst), found.runs, found.failed]
+        [label, finding.metric, *_three(found.score), *_three(found.worst), found.resampled, found.runs, found.failed]
         for finding in findings
         for label, found in finding.stability.items()
     ]
@@ -195,6 +199,12 @@ def _markdown(
     for finding in findings:
         parts += [f"## By {finding.metric}", _scores(finding), _points(stress, finding)]
         parts += [FILTER_NOTE] if finding.filtered else []
+        unscored = sum(lacks_weights(result, finding.metric) for _, result in _results(stress, store))
+        if unscored:
+            parts.append(
+                f"**{unscored} runs were scored without weights for {finding.metric}, and are not among these.** The "
+                "same command makes them again where there are weights and time."
+            )
     failures = [
         escaped(f"{run.scene.name}, {run.variant.name}, seed {run.seed}: {entry.status}: {entry.reason}")
         for run in stress.plan.runs
@@ -214,7 +224,9 @@ def _markdown(
     parts.append(
         "S is the interquartile mean of retentions, CVaR10 the mean of the worst tenth; retention is the gain over "
         f"`nothing` as a share of the same method's gain on the recording as it is. It breaks where retention falls "
-        f"below {BROKEN:g}. Intervals are 95 %, by resampling scenes and seeds; there is none for fewer than five runs."
+        f"below {BROKEN:g}. Intervals are 95 %, by resampling scenes, then seeds, from {LEAST_RUNS} recordings on. "
+        "With fewer, those of S and CVaR10 resample kinds of harm: they say how much these depend on which kinds were "
+        "tried, and nothing of other recordings."
     )
     parts += ["## Conditions", _conditions(stress, store)]
     return "\n\n".join(parts) + "\n"
@@ -241,21 +253,16 @@ def _points(stress: StressPlan, finding: Finding) -> str:
     units = {harm.kind.named(): harm.kind.unit for harm in stress.harms}
     kinds = [kind for kind in units if any((label, kind) in finding.breakdowns for label in finding.stability)]
     columns = {
-        f"{finding.marked(label)} breaks at": [_place(finding.breakdowns.get((label, kind))) for kind in kinds]
+        f"{finding.marked(label)} breaks at": [_place(finding, label, kind) for kind in kinds]
         for label in finding.stability
     }
     cells = {"kind": [f"`{kind}`" for kind in kinds], "unit": [units[kind] for kind in kinds]}
     return markdown_table({**cells, **columns}, right=columns)
 
 
-def _place(found: Breakdown | None) -> str:
-    if found is None:
-        return "–"
-    least = f"{found.amounts[-1]:g}"
-    if found.point is None:
-        return f"not up to {least}"
-    low, high = (least if end is None else f"{end:.3g}" for end in found.interval)
-    return f"{found.point:.3g}" + ("" if found.interval == (None, None) else f" ({low} to {high})")
+def _place(finding: Finding, label: str, kind: str) -> str:
+    found = finding.breakdowns.get((label, kind))
+    return NO_FIGURE if found is None else place(found)
 
 
 def _draw(stress: StressPlan, finding: Finding, out: Path) -> list[Path]:

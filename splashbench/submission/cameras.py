@@ -11,10 +11,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from splashbench.errors import SplashbenchError
-from splashbench.files import read_model, write_model
+from splashbench.errors import SplashbenchError, one_line
+from splashbench.files import read_model
 from splashbench.scene import Camera, ContainerMesh, Scene, TrainingScene
 
 CAMERAS = "cameras.json"
@@ -53,11 +53,22 @@ class SceneViews(BaseModel):
     cameras: list[_View] = Field(min_length=1, max_length=_MAX_CAMERAS)
 
 
-def write_cameras(directory: Path, scene: Scene, kept: Sequence[int] | None = None) -> None:
-    """Write cameras.json of `scene` into the submission's folder.
+def scene_views(scene: Scene, kept: Sequence[int] | None = None) -> SceneViews:
+    """What cameras.json says of `scene`. kept: the timesteps that the method saw; all by default.
 
-    kept: the timesteps that the method saw; all by default.
+    Raises SplashbenchError for a scene that it has no room for; to be called before hours go into a fit.
     """
+    try:
+        return _scene_views(scene, kept)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = " ".join(map(str, first["loc"]))
+        raise SplashbenchError(
+            f"{scene.directory}: a submission cannot say its cameras ({place}: {one_line(first['msg'])}); change them"
+        ) from None
+
+
+def _scene_views(scene: Scene, kept: Sequence[int] | None) -> SceneViews:
     steps = list(range(scene.n_frames) if kept is None else kept)
     views = [
         _View(
@@ -73,7 +84,7 @@ def write_cameras(directory: Path, scene: Scene, kept: Sequence[int] | None = No
         )
         for name, camera in scene.cameras.items()
     ]
-    model = SceneViews(
+    return SceneViews(
         scene=scene.name,
         times=scene.times[steps].tolist(),
         times_source=scene.times_source,
@@ -83,7 +94,6 @@ def write_cameras(directory: Path, scene: Scene, kept: Sequence[int] | None = No
         is_released=scene.is_released,
         cameras=views,
     )
-    write_model(Path(directory) / CAMERAS, model)
 
 
 def read_cameras(directory: Path) -> AbsentScene | None:

@@ -34,7 +34,8 @@ def write_scene_files(directory: Path, scene: Scene) -> None:
 
 
 def _files(scene: Scene) -> dict[str, str]:
-    paths = sorted(path for path in scene.directory.glob("*.json") if path.is_file())[:_MAX_FILES]
+    found = [path for path in scene.directory.glob("*.json") if path.is_file() and path.name.isprintable()]
+    paths = sorted(found)[:_MAX_FILES]
     return {path.name: sha256_file(path) for path in paths}
 
 

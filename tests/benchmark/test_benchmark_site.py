@@ -14,7 +14,14 @@ from typing import Any
 import pytest
 
 from splashbench.benchmark import repository
-from splashbench.benchmark.repository import WORKFLOW, init_benchmark, read_benchmark, read_entries, workflow_fault
+from splashbench.benchmark.repository import (
+    WORKFLOW,
+    init_benchmark,
+    read_benchmark,
+    read_entries,
+    result_fault,
+    workflow_fault,
+)
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import list_files, sha256_file
@@ -404,3 +411,15 @@ def test_a_workflow_that_asks_an_index_is_told(words: str, tmp_path: Path, capsy
     warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     assert len(warnings) == 1
     assert "asks a package index for splashbench, which none has" in warnings[0]
+
+
+def test_a_result_of_another_protocol_does_not_count_whatever_it_states(benchmark: Path) -> None:
+    here = read_benchmark(benchmark)
+    (entry,) = read_entries(benchmark, here)
+    result = next(iter(entry.results.values()))
+    assert result_fault(result, here) == ""
+    changed = result.protocol.model_copy(update={"opacity_threshold": 0.05})
+    # Its digests still say v1: what they say is held against the settings beside them.
+    forged = result.model_copy(update={"protocol": changed})
+    assert "another protocol" in result_fault(forged, here)
+    assert "digests.protocol is not that of its protocol" in list(forged.faults())

@@ -112,3 +112,35 @@ def test_files_that_belong_together_do_not_come_in_part(tmp_path: Path) -> None:
             (staging / name).write_text("new")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["b.txt"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_picture_takes_no_file_of_the_scene_and_is_a_png(
+    balls_copy: Path, submission: Path, tmp_path: Path, fails: Fails
+) -> None:
+    photograph = balls_copy / "ims" / "1" / "000000.png"
+    before = photograph.read_bytes()
+    scored = ["score", submission, "--scene", balls_copy, "--out", tmp_path / "results", "--sheet"]
+    assert f"{photograph} is a file of" in fails(*scored, photograph)
+    assert "give a name that ends in .png" in fails(*scored, tmp_path / "sheet.txt")
+    assert f"{photograph} is a file of" in fails(
+        "scene", "reconstruct-container", balls_copy, "--replace", "--picture", photograph
+    )
+    assert photograph.read_bytes() == before
+    assert not (tmp_path / "results").exists()
+
+
+def test_nothing_goes_into_a_sealed_submission(
+    balls_directory: Path, results: Path, submission: Path, fails: Fails
+) -> None:
+    sealed = f"lies in {submission}, whose files are sealed"
+    assert sealed in fails("leaderboard", results, submission / "board")
+    masks = balls_directory / "seg"
+    assert sealed in fails("masks", "compare", masks, masks, "--out", submission / "masks")
+    assert sealed in fails("scene", "export", balls_directory, submission / "scene", "--format", "colmap")
+    assert main(["check", str(submission)]) == 0
+
+
+def test_a_study_does_not_work_in_its_scene(balls_copy: Path, fails: Fails) -> None:
+    words = ["study", "stress", balls_copy / "out", "--methods", "hull_points", "--scenes", balls_copy]
+    assert f"lies in the scene {balls_copy}" in fails(*words, "--kinds", "haze", "--severities", "3")
+    assert not (balls_copy / "out").exists()

@@ -396,3 +396,10 @@ def test_options_that_do_not_go_together_are_wrong_usage(
         main(["run-external", "scene", "out", *options])
     assert stop.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_command_that_is_no_text_is_told_before_it_runs(balls_directory: Path, tmp_path: Path) -> None:
+    code = ExternalCode("theirs", "true \udcff", "blender", render_command=_render("good"), points=POINTS)
+    with pytest.raises(SplashbenchError, match="is no UTF-8"):
+        run_external(code, balls_directory, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from splashbench.errors import SplashbenchError
 from splashbench.harness import clock, leftovers
 from splashbench.harness.clock import Report, fit_time, frames_per_second, state_seconds
 from splashbench.harness.keeper import _Line
@@ -235,3 +236,12 @@ def test_views_that_a_method_takes_out_of_its_copy_of_the_scene_are_missed(
     submission = _run("ForgetsViews", balls_directory, tmp_path / "out")
     assert submission.status == Status.INCOMPLETE
     assert submission.reason == "camera 7, timestep 0: there is no picture in renders"
+
+
+def test_two_runs_do_not_write_one_submission(balls_directory: Path, tmp_path: Path) -> None:
+    """The second one would fit to its end, and be thrown away."""
+    (other := tmp_path / ".tmp-0123abcd-out").mkdir()
+    with leftovers.held(other), pytest.raises(SplashbenchError, match="another run is writing"):
+        _run("ClaimsOverhead", balls_directory, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert _run("ClaimsOverhead", balls_directory, tmp_path / "out").status == Status.OK

@@ -233,3 +233,37 @@ def test_the_committed_page_is_what_its_results_give(data_of: DataOf) -> None:
                 assert kept["estimates"][label]["figures"][name]["value"] == pytest.approx(found["value"], rel=1e-4)
     assert len(committed["runs"]) == len(made["runs"]) == len(sources)
     assert any(run["sheet"] for run in committed["runs"])
+
+
+def test_a_run_that_failed_on_another_machine_than_nothing_is_charged_as_well(
+    make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf
+) -> None:
+    """`nothing` needs no GPU: what it shows of a scene is the same for whoever ran on one."""
+    for seed in range(4):
+        failed = {"status": "crashed", "reason": "no memory"} if seed == 3 else {"psnr": 25.0, "fit_seconds": 9.0}
+        make_result("m", seed, cpu="a GPU", **failed).save(tmp_path / "results")
+        make_result("o", seed, cpu="a GPU", psnr=22.0, fit_seconds=9.0).save(tmp_path / "results")
+    make_result("nothing", 0, control=True, psnr=10.0, fit_seconds=3.0).save(tmp_path / "results")
+    here = next(g for g in data_of(page_of(tmp_path / "results"))["groups"] if "a GPU" in g["machine"])
+    after = next(standing for standing in here["standings"]["psnr"] if standing["seconds"] == 60)
+    assert [row["label"] for row in after["ranking"]] == ["m", "o"]
+    assert here["estimates"]["m"]["figures"]["psnr"] == {"value": 25.0, "interval": None, "runs": 4}
+
+
+def test_a_figure_says_how_many_of_the_runs_it_is_of(
+    make_result: Any, tmp_path: Path, page_of: PageOf, data_of: DataOf
+) -> None:
+    figures = {"psnr": 28.0, "dpsnr_bg": 12.0, "ssim": 0.99, "jitter_error": 0.01, "fit_seconds": 9.0}
+    make_result("m", 0, **figures).save(tmp_path / "results")
+    for seed in (1, 2, 3):
+        make_result("m", seed, status="crashed", reason="no memory").save(tmp_path / "results")
+    make_result("nothing", 0, control=True, psnr=10.0, ssim=0.5, fit_seconds=3.0).save(tmp_path / "results")
+    (here,) = data_of(page_of(tmp_path / "results"))["groups"]
+    found = here["estimates"]["m"]["figures"]
+    assert [(found[name]["value"], found[name]["runs"]) for name in ("psnr", "ssim", "dpsnr_bg")] == [
+        (10.0, 4),
+        (0.5, 4),
+        (0.0, 4),
+    ]
+    # What `nothing` does not have cannot be charged, nor can a cost.
+    assert [found[name]["runs"] for name in ("jitter_error", "fit_seconds")] == [1, 1]

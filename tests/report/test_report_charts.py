@@ -151,3 +151,21 @@ def test_a_chart_of_one_run_or_of_failures_alone_can_be_drawn(make_result: Any, 
     values = {"psnr": 20.0, "fit_seconds": 5.0} if status == "ok" else {}
     png, _ = speed_accuracy_chart([ResultFile("a.json", make_result("alpha", 0, "bowl", status, **values))], tmp_path)
     assert image_size(png)[1] > 300
+
+
+def test_the_front_is_of_methods_that_ran_on_the_same_scenes_without_failure(make_result: Any) -> None:
+    """One that came through on the easy scene alone would stand before all."""
+    results = [make_result("whole", 0, scene, psnr=22.0, fit_seconds=60.0) for scene in ("easy", "b", "c")]
+    results.append(make_result("crasher", 0, "easy", psnr=29.0, fit_seconds=40.0))
+    results += [make_result("crasher", 0, scene, "crashed", "no memory") for scene in "bc"]
+    results.append(make_result("picky", 0, "easy", psnr=28.0, fit_seconds=30.0))
+    (machine,) = machines([ResultFile(f"{n}.json", result) for n, result in enumerate(results)])
+    assert {entry.label: entry.compares for entry in machine.entries} == {
+        "whole": True,
+        "crasher": False,
+        "picky": False,
+    }
+    assert machine.n_scenes == 3
+    picky = next(entry for entry in machine.entries if entry.label == "picky")
+    assert picky.shared is None
+    assert picky.summary("psnr") is not None

@@ -173,3 +173,46 @@ def test_a_file_that_is_no_result_is_named(folder: Path, tmp_path: Path) -> None
         load_results(folder)
     with pytest.raises(SplashbenchError, match="holds no results"):
         load_results(tmp_path / "empty")
+
+
+def test_means_mix_neither_settings_nor_what_scenes_told(make_result: Any) -> None:
+    results = [
+        make_result("m", 0, "a", psnr=10.0, told=None),
+        make_result("m", 1, "a", psnr=10.0, told=("times",)),
+        make_result("m", 1, "b", psnr=40.0, told=("times",)),
+        *(
+            make_result("n", 0, scene, psnr=20.0 + size, told=("times",), settings={"size": size})
+            for scene in "ab"
+            for size in (5, 10)
+        ),
+    ]
+    sources = [ResultFile(f"{n}.json", result) for n, result in enumerate(results)]
+    means = to_markdown(leaderboard_table(sources), sources).partition("## Mean over 2 scenes")[2].partition("##")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in means.splitlines() if "of 2" in line]
+    assert sorted((row[0], row[2], row[3], row[4]) for row in rows) == [
+        ("m", "1 of 2", "not noted", "–"),
+        ("m", "2 of 2", "times", "25.00"),
+        ("n", "2 of 2", "times", "25.00"),
+        ("n", "2 of 2", "times", "30.00"),
+    ]
+    assert len({row[1] for row in rows if row[0] == "n"}) == 2
+
+
+def test_a_figure_that_one_seed_lacks_is_told(make_result: Any) -> None:
+    results = [make_result("m", 0, psnr=20.0, lpips=0.1), make_result("m", 1, psnr=20.0)]
+    sources = [ResultFile(f"{n}.json", result) for n, result in enumerate(results)]
+    told = to_markdown(leaderboard_table(sources), sources).partition("## Why a figure is missing")[2]
+    assert "(m, seed 1 on " in next(line for line in told.splitlines() if line.startswith("- lpips: "))
+
+
+def test_figures_against_two_truths_are_not_averaged(make_result: Any) -> None:
+    results = [make_result("m", seed, psnr=20.0, sdf_iou=iou) for seed, iou in enumerate((0.9, 0.3))]
+    results = [
+        result.model_copy(update={"digests": result.digests.model_copy(update={"truth": str(n) * 64})})
+        for n, result in enumerate(results)
+    ]
+    sources = [ResultFile(f"{n}.json", result) for n, result in enumerate(results)]
+    table = leaderboard_table(sources)
+    assert table["psnr"].tolist() == [20.0]
+    assert table["sdf_iou"].isna().all()
+    assert "different true particles" in to_markdown(table, sources)

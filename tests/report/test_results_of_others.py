@@ -20,7 +20,7 @@ from splashbench.report.speed_accuracy import machines
 from splashbench.report.table import leaderboard_table, to_csv
 from splashbench.report.table_markdown import to_markdown
 from splashbench.scene import Scene
-from splashbench.score.result import MAX_CLAIMS, Result
+from splashbench.score.result import MAX_CLAIMS, MetricValue, Result
 from splashbench.score.verification import Evidence
 
 Edit = Callable[[dict[str, Any]], object]
@@ -59,6 +59,8 @@ def _figure(name: str, value: Any) -> Edit:
             "metrics.psnr.views.6.frames.0",
         ),
         (lambda d: d.update(checkpoints=[{"seconds": 1.0, "metrics": {"miou": 2.0}}]), "checkpoints.0.miou is 2"),
+        (lambda d: d.update(checkpoints=[{"seconds": 1.0, "storage_bytes": 10**400}]), "storage_bytes"),
+        (lambda d: d["protocol"].update(opacity_threshold=0.05), "digests.protocol is not that of its protocol"),
     ],
 )
 def test_what_scoring_never_writes_costs_one_row_and_is_named(
@@ -264,3 +266,21 @@ def test_with_paper_says_when_it_adds_nothing(
     make_result("alpha", scene="watersphere", psnr=20.0, fit_seconds=9.0).save(tmp_path / "results")
     assert main(words) == 0
     assert "adds nothing" not in capsys.readouterr().err
+
+
+def test_of_two_scores_of_one_submission_the_fuller_one_counts_in_whatever_order(
+    tmp_path: Path, make_result: Any
+) -> None:
+    """What an older score did not note, and what it lacked weights or truth for, contradicts nothing."""
+    full = make_result("alpha", told=("times",), psnr=20.0, lpips=0.1, sdf_iou=0.8)
+    old = full.model_copy(
+        update={"told": None, "metrics": {**full.metrics, "lpips": MetricValue(), "sdf_iou": MetricValue()}}
+    )
+    for number, pair in enumerate(((full, old), (old, full))):
+        folder = tmp_path / str(number)
+        for name, result in zip("ab", pair):
+            (folder / name).mkdir(parents=True)
+            result.save(folder / name)
+        (kept,) = load_results(folder)
+        assert kept.result.told == ("times",)
+        assert kept.result.value("lpips") == pytest.approx(0.1)

@@ -57,7 +57,7 @@ def twice(directory: Path) -> None:
     ("change", "said"),
     [
         (set_camera("k", [[100, 0, 48], [0, 100, 32], [0, 0, 0]]), "camera 2: K is not that of a pinhole"),
-        (set_camera("k", [[100, 50, 48], [0, 100, 32], [0, 0, 1]]), "camera 2: K is not that of a pinhole"),
+        (set_camera("k", [[100, 50, 48], [0, 100, 32], [0, 0, 1]]), "camera 2: K has skew"),
         (set_camera("k", [[100, 0, 48], [7, 100, 32], [0, 0, 1]]), "camera 2: K is not that of a pinhole"),
         (set_camera("k", [[1e-6, 0, 48], [0, 1e-6, 32], [0, 0, 1]]), "camera 2: its angle of view is 180 degrees"),
         (set_camera("k", [[1e8, 0, 48], [0, 1e8, 32], [0, 0, 1]]), "camera 2: its angle of view is"),

@@ -14,7 +14,15 @@ from splashbench.files import write_model
 from splashbench.harness.discovery import load_method
 from splashbench.scene import Scene
 from splashbench.score.image.fidelity import psnr
-from splashbench.study.capacity import MEAN, capacity_frame, curves, make_capacity_plan, smallest_first
+from splashbench.study.capacity import (
+    COSTS,
+    MEAN,
+    QUALITIES,
+    capacity_frame,
+    curves,
+    make_capacity_plan,
+    smallest_first,
+)
 from splashbench.study.job import RunEntry, Store
 from splashbench.study.ladder import declared_ladder, parse_ladder
 from splashbench.study.spending import StudyBudget
@@ -241,3 +249,23 @@ def test_capacity_frame_has_a_row_for_what_was_not_run(balls_directory: Path, tm
     frame = capacity_frame(capacity, Store(tmp_path))
     assert list(frame.status) == ["not run", "not run"]
     assert frame.psnr.isna().all()
+
+
+def test_a_seed_that_failed_on_one_rung_shifts_no_curve() -> None:
+    """Seeds differ by 10 dB, and rungs by nothing: with seed 0 in two of three means the last rung would gain 5 dB."""
+    rows = [
+        {"rung": rung, "scene": "a", "seed": seed, "status": "ok", "psnr": 20.0 + 10 * seed}
+        for rung in (1, 2, 3)
+        for seed in (0, 1)
+        if (rung, seed) != (3, 0)
+    ]
+    rows.append({"rung": 3, "scene": "a", "seed": 0, "status": "crashed"})
+    figures = [*COSTS, *QUALITIES, *(f"train_{name}" for name in QUALITIES)]
+    frame = pd.DataFrame(rows).reindex(columns=["rung", "scene", "seed", "status", *figures])
+    curve = curves(frame)["a"]
+    assert curve["psnr"].tolist() == [30.0, 30.0, 30.0]
+    assert curve["ok"].tolist() == [2, 2, 1]
+    # A rung on which every seed failed has no figure, and takes none from the others.
+    none = pd.concat([frame, frame[frame.rung == 1].assign(rung=4, status="crashed", psnr=float("nan"))])
+    assert curves(none)["a"]["psnr"].tolist()[:3] == [30.0, 30.0, 30.0]
+    assert curves(none)["a"]["psnr"].isna().tolist() == [False, False, False, True]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from splashbench.errors import SplashbenchError
 from splashbench.files import write_model
 from splashbench.study import commit as committing
 from splashbench.study.commit import commit, commit_failure, new_attempt, recover
@@ -167,3 +169,25 @@ def test_damage_in_the_folder_of_attempts_is_no_error(store: Store) -> None:
     assert not attempt.folder.exists()
     shutil.rmtree(store.cache)
     recover(store)
+
+
+@pytest.mark.parametrize("title", ["/victim", "../victim", "..", "a/../../victim", "a\\b", "a\nb", ""])
+def test_a_folder_from_elsewhere_writes_and_deletes_nothing_outside(store: Store, title: str) -> None:
+    victim = store.out.parent / "victim"
+    victim.mkdir()
+    (victim / "mine.txt").write_text("dear")
+    attempt = _attempt(store)
+    request = json.loads(attempt.request.read_text())
+    named = str(victim) if title == "/victim" else title
+    attempt.request.write_text(json.dumps({**request, "title": named}))
+    store.runs.mkdir()
+    stale = {"digest": DIGEST, "title": "a", "status": "error", "result": "../../victim/mine.txt"}
+    store.entry_path(DIGEST).write_text(json.dumps(stale))
+    recover(store)
+    assert (victim / "mine.txt").read_text() == "dear"
+    assert sorted(path.name for path in victim.iterdir()) == ["mine.txt"]
+    # With a good title it is the earlier entry that leads out, and is refused by name.
+    store.attempts.mkdir(exist_ok=True)
+    with pytest.raises(SplashbenchError, match=r"0123456789abcdef.json.*no plain name"):
+        commit(store, _attempt(store))
+    assert (victim / "mine.txt").read_text() == "dear"

@@ -13,9 +13,9 @@ import pytest
 from splashbench.cli.main import main
 from splashbench.study.job import Store
 from splashbench.study.spending import Cell, StudyBudget, by_uncertainty
-from splashbench.study.stability import StressRun
+from splashbench.study.stability import Breakdown, StressRun, breakdown
 from splashbench.study.stress import make_stress_plan
-from splashbench.study.stress_pages import page_name, summaries
+from splashbench.study.stress_pages import page_name, place, summaries
 
 METHODS = Path(__file__).with_name("study_methods.py")
 CAUTIOUS, GREY = f"{METHODS}:Cautious", f"{METHODS}:Grey"
@@ -99,10 +99,25 @@ def test_the_worst_kind_comes_first() -> None:
         StressRun("m", "s", 0, kind, level, None if kept == 0 else 1.0): kept
         for kind, level, kept in (("a", 3, 0.9), ("a", 5, 0.2), ("b", 3, 0.0), ("c", 5, 0.7))
     }
-    rows = summaries(found)
+    breakdowns = {
+        "a": Breakdown((0.0, 1.0, 2.0), (1, 0.9, 0.2), (1, 0.9, 0.2), 1.6, (None, None)),
+        "b": Breakdown((0.0, 1.0), (1, 0.0), (1, 0.0), 0.5, (None, None)),
+        "c": Breakdown((0.0, 2.0), (1, 0.7), (1, 0.7), None, (None, None)),
+    }
+    rows = summaries(found, breakdowns)
     assert [row.kind for row in rows] == ["b", "a", "c"]
     assert [row.breaks_at for row in rows] == [3, 5, None]
+    assert [place(row.found) for row in rows] == ["0.5", "1.6", "not up to 2"]
     assert rows[0].failed == 1
+
+
+def test_bad_luck_at_one_severity_breaks_nothing_on_the_page_either() -> None:
+    kept = (0.4, 0.9, 0.8, 0.7, 0.6)
+    found = {StressRun("m", "s", 0, "a", level, 1.0): value for level, value in enumerate(kept, 1)}
+    curve = breakdown(found, "a", [0, 1, 2, 3, 4, 5])
+    (row,) = summaries(found, {"a": curve})
+    assert row.breaks_at is None
+    assert curve.point is None
 
 
 def test_pages_have_names_of_their_own_whatever_methods_are_called() -> None:

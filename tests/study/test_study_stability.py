@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from splashbench.study.stability import StressRun, breakdown, retentions, stability, worst_mean
+from splashbench.study.stability import Stability, StressRun, breakdown, retentions, stability, worst_mean
 
 NOTHING = {("a", 0): 10.0, ("b", 0): 10.0, ("a", 1): 10.0}
 
@@ -40,18 +40,45 @@ def test_the_worst_tenth_holds_a_run_at_least() -> None:
     assert worst_mean(np.array([[3.0, 2.0], [1.0, np.nan]])) == pytest.approx([2.0, 1.0])
 
 
-def test_stability_counts_failures_and_has_an_interval_where_runs_are_enough() -> None:
-    runs = [
-        run(0, 30.0),
-        *(run(level, 30.0) for level in range(1, 6)),
-        *(run(level, None, "gamma") for level in range(1, 6)),
-    ]
+KINDS = ("haze", "gamma", "blur", "noise", "holes", "drift")
+
+
+def test_stability_counts_failures_and_resamples_kinds_where_recordings_are_few() -> None:
+    runs = [run(0, 30.0)]
+    for number, kind in enumerate(KINDS):
+        runs += [run(level, 30.0 if number % 2 else None, kind) for level in range(1, 6)]
     found = stability(retentions(runs, NOTHING, higher_is_better=True))
-    assert (found.runs, found.failed) == (10, 5)
+    assert (found.runs, found.failed, found.resampled) == (30, 15, "kinds")
     assert found.score.value == pytest.approx(0.5)
     assert found.worst.value == 0.0
-    low, high = found.score.interval or (math.nan, math.nan)
-    assert 0 <= low < 0.5 < high <= 1
+    # Of six kinds that keep all or nothing, whole kinds are drawn: 30 runs one by one would lie closer about .5.
+    assert found.score.interval == pytest.approx((0.0, 1.0), abs=0.01)
+    of_four = {r: kept for r, kept in retentions(runs, NOTHING, higher_is_better=True).items() if r.kind in KINDS[:4]}
+    assert stability(of_four).score.interval is None
+
+
+def test_stability_resamples_recordings_with_all_that_was_done_to_them() -> None:
+    """However many harms there are, it is the recordings whose spread is told."""
+
+    def of(kept: dict[tuple[str, int], float]) -> Stability:
+        return stability(
+            {
+                run(level, 1.0, kind, scene, seed): value
+                for (scene, seed), value in kept.items()
+                for kind in KINDS
+                for level in range(1, 6)
+            }
+        )
+
+    alike = of({(scene, seed): 0.7 for scene in "ab" for seed in range(3)})
+    assert alike.resampled == "recordings"
+    assert alike.score.interval == pytest.approx((0.7, 0.7))
+    apart = of({(scene, seed): value for scene in "ab" for seed, value in enumerate((0.0, 0.5, 1.0))})
+    assert apart.score.value == pytest.approx(0.5)
+    low, high = apart.score.interval or (math.nan, math.nan)
+    assert low < 0.2
+    assert high > 0.8
+    assert of({("a", 0): 0.2, ("b", 0): 0.8}).resampled == "kinds"
 
 
 def test_a_method_breaks_between_the_severities_that_say_so() -> None:
@@ -84,13 +111,35 @@ def test_a_curve_never_rises_and_luck_at_one_severity_is_evened_out() -> None:
 def test_the_interval_spans_scenes_that_break_elsewhere() -> None:
     runs = []
     for scene, kept in (("a", (1, 0.9, 0.0)), ("b", (0.2, 0.0, 0.0))):
-        runs += [run(0, 30.0, scene=scene), *(run(k, 10 + 20 * v, scene=scene) for k, v in enumerate(kept, 1))]
-    found = breakdown(retentions(runs, NOTHING, higher_is_better=True), "haze", [0, 1, 2, 3])
+        for seed in range(3):
+            of = {"scene": scene, "seed": seed}
+            runs += [run(0, 30.0, **of), *(run(k, 10 + 20 * v, **of) for k, v in enumerate(kept, 1))]
+    nothing = {(scene, seed): 10.0 for scene in "ab" for seed in range(3)}
+    of_four = [r for r in runs if r.seed < 2]
+    assert breakdown(retentions(of_four, nothing, True), "haze", [0, 1, 2, 3]).interval == (None, None)
+    found = breakdown(retentions(runs, nothing, True), "haze", [0, 1, 2, 3])
     low, high = found.interval
     assert found.point is not None
     assert low == pytest.approx(0.625)  # scene b alone
     assert high == pytest.approx(2 + 0.4 / 0.9)  # scene a alone
     assert low < found.point < high
+
+
+def test_runs_that_a_budget_left_out_shift_no_breaking_point() -> None:
+    """Ten scenes, of which one breaks at once; a bisection runs its first severity, and the last ones of the others."""
+    amounts = [0, 1, 2, 3, 4, 5]
+    whole, bisected = {}, {}
+    for scene in range(10):
+        for level in range(1, 6):
+            ran = run(level, 1.0, scene=f"s{scene}")
+            whole[ran] = 0.0 if scene == 0 else 1.0
+            if level in ((1, 3) if scene == 0 else (3, 5)):
+                bisected[ran] = whole[ran]
+    assert breakdown(bisected, "haze", amounts) == breakdown(whole, "haze", amounts)
+    assert breakdown(whole, "haze", amounts).point is None
+    # Between two runs and before the first it is read from both; beyond the last it stays.
+    one = {run(2, 1.0): 0.8, run(4, 1.0): 0.2}
+    assert breakdown(one, "haze", amounts).retentions == pytest.approx((1, 0.9, 0.8, 0.5, 0.2, 0.2))
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:

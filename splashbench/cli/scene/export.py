@@ -52,10 +52,12 @@ def register(actions: argparse._SubParsersAction) -> None:
 
 def export(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene export`."""
+    from splashbench.files import require_unsealed_place
     from splashbench.observe import initial_points
     from splashbench.scene import Scene
     from splashbench.scene.export import export_scene, remarks
 
+    require_unsealed_place(arguments.out)
     scene = Scene.open(arguments.scene)
     facts = export_scene(
         scene,

@@ -67,15 +67,16 @@ def register(actions: argparse._SubParsersAction) -> None:
 
 def place_container(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene place-container`."""
-    from splashbench.container.entry import doubtful, picture, require_picture
+    from splashbench.container.entry import doubtful, picture
     from splashbench.container.scene_placement import place_in_scene, require_container_place, write_placement
-    from splashbench.files import write_png
+    from splashbench.files import require_picture_place, write_png
     from splashbench.scene import Scene
     from splashbench.scene.container import read_mesh
 
     scene = Scene.open(arguments.scene)
     require_container_place(scene, arguments.mesh, arguments.replace)
-    require_picture(arguments.picture)
+    if arguments.picture is not None:
+        require_picture_place(arguments.picture, scene.directory)
     mesh = read_mesh(arguments.mesh)
     mask_scene = None if arguments.masks is None else Scene.open(arguments.masks)
     say("placing the mesh by its masks")

@@ -45,10 +45,10 @@ def register(actions: argparse._SubParsersAction) -> None:
 
 def reconstruct_container(arguments: argparse.Namespace) -> int:
     """Handle `splashbench scene reconstruct-container`."""
-    from splashbench.container.entry import doubtful, require_picture, require_place
+    from splashbench.container.entry import doubtful, require_place
     from splashbench.container.reconstruction import container_from_footage, picture, write_reconstruction
     from splashbench.errors import SplashbenchError
-    from splashbench.files import write_png
+    from splashbench.files import require_picture_place, write_png
     from splashbench.scene import Scene
 
     scene = Scene.open(arguments.scene)
@@ -58,7 +58,8 @@ def reconstruct_container(arguments: argparse.Namespace) -> int:
             " seen; place a scan (`splashbench scene place-container`)"
         )
     require_place(scene, arguments.replace)
-    require_picture(arguments.picture)
+    if arguments.picture is not None:
+        require_picture_place(arguments.picture, scene.directory)
     mask_scene = None if arguments.masks is None else Scene.open(arguments.masks)
     say(f"reconstructing the container from {len(scene.train)} training views")
     reconstruction = container_from_footage(scene, mask_scene)

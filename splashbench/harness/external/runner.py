@@ -14,18 +14,18 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_directory, require_folder_place
+from splashbench.files import atomic_directory, require_folder_place, write_model
 from splashbench.harness import hardware
 from splashbench.harness.external.commands import require_command
 from splashbench.harness.external.importers import load_importer
 from splashbench.harness.external.phases import ExternalCode, ExternalRun
-from splashbench.harness.leftovers import clear_leftovers, held, scratch_folder
+from splashbench.harness.leftovers import clear_leftovers, held, require_alone, scratch_folder
 from splashbench.harness.messages import Failure
 from splashbench.harness.runner import TIMING_FRAMES, drop_unwanted, require_unchanged, without_nulls
 from splashbench.scene import Scene
 from splashbench.scene.export import InitialPoints
 from splashbench.submission import IDENTITY, Identity, Status, Submission, identity_text, seal
-from splashbench.submission.cameras import write_cameras
+from splashbench.submission.cameras import CAMERAS, scene_views
 from splashbench.submission.scene_files import write_scene_files
 from splashbench.version import __version__
 
@@ -69,6 +69,8 @@ def run_external(
         _require_apart(work, out, *inputs)
     scene = Scene.open(scene_directory)
     identity = _identity(code, scene, preset or PRESET, seed, device)
+    views = scene_views(scene)
+    require_alone(out)
     clear_leftovers(out)
     with (
         atomic_directory(out, replace=replace, holds=IDENTITY, inputs=inputs) as staging,
@@ -90,7 +92,7 @@ def run_external(
                 record = run.record.model_copy(update=fault)
         drop_unwanted(staging, record.status, keep_model)
         require_unchanged(scene, code.name)
-        write_cameras(staging, scene)
+        write_model(staging / CAMERAS, views)
         if record.status == Status.OK:
             write_scene_files(staging, scene)
         seal(staging, identity, record)
@@ -149,7 +151,10 @@ def _identity(code: ExternalCode, scene: Scene, preset: str, seed: int, device: 
     except ValidationError as error:
         first = error.errors()[0]
         raise SplashbenchError(f"{first['loc'][0]} {first['input']!r}: {first['msg']}; give another") from None
-    identity_text(identity)
+    try:
+        identity_text(identity).encode("utf-8")
+    except UnicodeEncodeError:
+        raise SplashbenchError("a command or name is no UTF-8, as submission.toml has to be; give another") from None
     return identity
 
 

@@ -61,7 +61,9 @@ def metric_facts() -> dict[str, dict[str, Any]]:
 def group_facts(group: Group) -> dict[str, Any]:
     """A group's curves, standings and estimates, over the scenes that its entries have in common; and its chases."""
     shared = comparable(group)
-    nothing = {name: before(shared, name) for name in QUALITY}
+    nothing = {name: before(shared, name) for name in QUALITIES}
+    # What `nothing` has over `nothing`, which is scored without that reference.
+    nothing["dpsnr_bg"] = dict.fromkeys(nothing["psnr"], 0.0)
     kept = {entry.label for entry in shared.entries}
     return {
         "shared_scenes": list(shared.scenes.values()) if kept else [],
@@ -122,13 +124,14 @@ def _estimate(found: Estimate) -> dict[str, Any]:
 def _estimates(nothing: Mapping[str, Mapping[str, float]], entry: Entry) -> dict[str, Any]:
     """Inter-quartile mean of each metric over the entry's runs, and how many there are and failed.
 
-    A failed run has the quality that `nothing` (by metric and scene) has of its scene, where known, and no cost.
+    A failed run has the quality that `nothing` (by metric and scene) has of its scene, where known, and no cost. `runs`
+    of a figure says how many it is over: the page marks those that leave some out, since these flatter.
     """
     figures: dict[str, Any] = {}
     fine = [result for result in entry.results if result.status == "ok"]
     for name in _SHOWN:
         values = {(r.digests.scene, r.seed): v for r in fine if (v := r.value(name)) is not None}
-        if name in QUALITY:
+        if name in QUALITIES:
             there = nothing[name]
             charged = [r for r in entry.results if r.status != "ok" and r.digests.scene in there]
             values |= {(r.digests.scene, r.seed): there[r.digests.scene] for r in charged}

@@ -126,17 +126,20 @@ function points(x, y, scene) {
   if (scene === ALL) return Object.keys(chosen.estimates).flatMap(label => {
     const { figures, runs, failed } = chosen.estimates[label];
     if (!Object.hasOwn(figures, x) || !Object.hasOwn(figures, y)) return [];
-    const note = `${runs} runs` + (failed ? `, ${failed} failed` : "");
+    const over = Math.min(figures[x].runs, figures[y].runs), note = `${runs} runs` + (failed ? `, ${failed} failed` : "") + (over < runs ? `; a figure is of ${over}` : "");
     return [{ label, failed, x: figures[x], y: figures[y], note, run: data.runs.findIndex(r => r.group === number && r.label === label) }];
   });
-  const found = new Map();
+  const found = new Map(), failures = new Map();
   data.runs.forEach((run, n) => {
-    if (run.group !== number || run.control || run.scene !== scene || !(x in run.figures) || !(y in run.figures)) return;
+    if (run.group !== number || run.control || run.scene !== scene) return;
+    if (run.status !== "ok") failures.set(run.label, (failures.get(run.label) || 0) + 1);
+    if (run.status !== "ok" || !(x in run.figures) || !(y in run.figures)) return;
     if (!found.has(run.label)) found.set(run.label, []);
     found.get(run.label).push({ n, x: run.figures[x], y: run.figures[y] });
   });
   const median = values => { const s = values.slice().sort((a, b) => a - b), m = s.length >> 1; return s.length % 2 ? s[m] : (s[m - 1] + s[m]) / 2; };
-  return [...found].map(([label, runs]) => ({ label, run: runs[0].n, note: `${runs.length} seed${runs.length === 1 ? "" : "s"}`,
+  return [...found].map(([label, runs]) => ({ label, run: runs[0].n, failed: failures.get(label) || 0,
+    note: `${runs.length} seed${runs.length === 1 ? "" : "s"}` + (failures.has(label) ? `, ${failures.get(label)} failed` : ""),
     x: { value: median(runs.map(r => r.x)), interval: [Math.min(...runs.map(r => r.x)), Math.max(...runs.map(r => r.x))] },
     y: { value: median(runs.map(r => r.y)), interval: [Math.min(...runs.map(r => r.y)), Math.max(...runs.map(r => r.y))] } }));
 }
@@ -166,7 +169,7 @@ function drawCost() {
     yaxis: { title: { text: data.metrics[y].label } } }), CONFIG).then(openPoint);
   const filtered = data.metrics[y].filtered ? found.filter(p => Object.hasOwn(group().estimates, p.label) && group().estimates[p.label].mixed).map(p => p.label) : [];
   byId("cost-note").textContent = found.length
-    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + (found.some(p => p.failed) ? "Hollow marks: some runs failed; these count with the quality of `nothing`. " : "") + "A click opens a run." + (found.length > marks.length ? ` ${found.length - marks.length} more methods are in the table alone.` : "") + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
+    ? (scene === ALL ? `Inter-quartile means with 95% intervals, over ${overScenes(group())}. ` : "Medians over seeds, from the least to the largest. ") + (found.some(p => p.failed) ? `Hollow marks: some runs failed; ${scene === ALL ? "these count with the quality of `nothing`" : "these are not in the median"}, and such a method is on no front. ` : "") + "A click opens a run." + (found.length > marks.length ? ` ${found.length - marks.length} more methods are in the table alone.` : "") + (filtered.length ? ` † ${filtered.join(", ")}: the figure rests on the filter of mixed methods.` : "")
     : "No run has both figures.";
 }
 
@@ -211,8 +214,9 @@ function drawSummary() {
   const shown = names.filter(name => kept.some(label => Object.hasOwn(chosen.estimates[label].figures, name)));
   const head = element("tr");
   head.append(element("th", "method"), element("th", "runs"), ...shown.map(name => element("th", data.metrics[name].label)), element("th", "hypervolume"));
-  const cell = (found, digits) => {
+  const cell = (found, digits, runs) => {
     const made = element("td", found ? number(found.value, digits) : "–");
+    if (found && found.runs < runs) made.append(element("small", `of ${found.runs} of ${runs} runs`));
     if (found && found.interval) made.append(element("small", `${number(found.interval[0], digits)} to ${number(found.interval[1], digits)}`));
     return made;
   };
@@ -221,8 +225,8 @@ function drawSummary() {
     const { figures, runs, failed, mixed } = chosen.estimates[label], row = element("tr");
     const count = element("td", `${runs}` + (failed ? `, ${failed} failed` : ""));
     row.append(element("th", label + (mixed ? " †" : ""), { scope: "row" }), count);
-    for (const name of shown) row.append(cell(figures[name], { psnr: 2, lpips: 4, miou: 3, spill: 3, jitter_error: 4, fit_seconds: 0, peak_memory_bytes: 0, storage_bytes: 1, render_fps: 1 }[name]));
-    row.append(cell(chosen.hypervolumes[label], 3));
+    for (const name of shown) row.append(cell(figures[name], { psnr: 2, lpips: 4, miou: 3, spill: 3, jitter_error: 4, fit_seconds: 0, peak_memory_bytes: 0, storage_bytes: 1, render_fps: 1 }[name], runs));
+    row.append(cell(chosen.hypervolumes[label], 3, runs));
     return row;
   }));
 }

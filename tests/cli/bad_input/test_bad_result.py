@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from splashbench.cli.main import main
+from splashbench.score.settings import Protocol
 
 Fails = Callable[..., str]
 
@@ -56,7 +57,12 @@ def test_results_of_another_protocol_have_a_table_of_their_own(results: Path, tm
     copy = Path(shutil.copytree(results, tmp_path / "results"))
     (path,) = copy.glob("*.json")
     shutil.copy(path, other := copy / "other.json")
-    edit(other, lambda d: (d["protocol"].update(grid_cells=50), d["digests"].update(protocol="1" * 64)))
+
+    def of_another(data: dict) -> None:
+        data["protocol"].update(grid_cells=50)
+        data["digests"].update(protocol=Protocol.model_validate(data["protocol"]).digest)
+
+    edit(other, of_another)
     assert main(["leaderboard", str(copy), str(tmp_path / "board")]) == 0
     rows = (tmp_path / "board" / "leaderboard.csv").read_text().splitlines()
     assert len(rows) == 3

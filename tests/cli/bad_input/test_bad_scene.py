@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splashbench.cli.main import main
+
 Fails = Callable[..., str]
 
 
@@ -60,6 +62,18 @@ def giant_png(path: Path, side: int) -> None:
         ("scene.json", lambda p: edit(p, lambda d: d["sizes"].update({"one": [96, 64]})), "names camera one"),
         ("init_pt_cld.npz", lambda p: np.savez(p, data=np.array([[object()]])), "without pickles"),
         ("init_pt_cld.npz", lambda p: p.write_bytes(b""), "not a readable .npz"),
+        ("init_pt_cld.npz", lambda p: np.savez(p, data=np.full((4, 7), 1e300)), "points lie beyond"),
+        ("init_pt_cld.npz", lambda p: np.savez(p, data=np.full((4, 7), 200.0)), "divide them by 255"),
+        (
+            "scene.json",
+            lambda p: edit(p, lambda d: d.update(camera_times={"6": [500 + t for t in d["times"]]})),
+            "seconds of one clock",
+        ),
+        (
+            "scene.json",
+            lambda p: edit(p, lambda d: d.update(camera_times={"6": [1000 * t for t in d["times"]]})),
+            "seconds of one clock",
+        ),
     ],
 )
 def test_a_damaged_file_of_a_scene_is_named(
@@ -118,3 +132,43 @@ def test_an_array_larger_than_memory_is_refused(balls_copy: Path, fails: Fails) 
     with zipfile.ZipFile(balls_copy / "init_pt_cld.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("data.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(10_000))
     assert "init_pt_cld.npz is not a readable .npz" in fails("scene", "check", balls_copy)
+
+
+def test_a_transposed_pose_is_told_by_every_command(balls_copy: Path, tmp_path: Path, fails: Fails) -> None:
+    def transpose(data: dict) -> None:
+        data["w2c"] = [[np.transpose(pose).tolist() for pose in row] for row in data["w2c"]]
+
+    edit(balls_copy / "train_meta.json", transpose)
+    for words in (["scene", "check", balls_copy], ["run", "hull_points", balls_copy, tmp_path / "out"]):
+        assert "w2c does not end in 0 0 0 1; it may be transposed" in fails(*words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_that_no_submission_can_name_is_told_before_the_fit(
+    balls_copy: Path, tmp_path: Path, fails: Fails
+) -> None:
+    long = "c" * 124
+    (balls_copy / "ims" / "2").rename(balls_copy / "ims" / long)
+    (balls_copy / "seg" / "2").rename(balls_copy / "seg" / long)
+    edit(
+        balls_copy / "train_meta.json",
+        lambda d: d.update(fn=[[n.replace("2/", f"{long}/", 1) if n[0] == "2" else n for n in r] for r in d["fn"]]),
+    )
+    edit(balls_copy / "scene.json", lambda d: d["sizes"].update({long: d["sizes"].pop("2")}))
+    line = fails("run", "hull_points", balls_copy, tmp_path / "out")
+    assert "a submission cannot say its cameras" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_of_a_name_that_is_no_text_ends_no_run(balls_copy: Path, tmp_path: Path) -> None:
+    Path(os.fsdecode(bytes(balls_copy) + b"/n\xe9.json")).write_text("{}")
+    assert main(["run", "hull_points", str(balls_copy), str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "scene_files.json").is_file()
+
+
+def test_test_views_without_masks_are_told_before_the_fit(
+    balls_copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(balls_copy / "seg" / "6")
+    assert main(["run", "hull_points", str(balls_copy), str(tmp_path / "out")]) == 0
+    assert "note: test views 6 have no masks, so that this run cannot be scored" in capsys.readouterr().err

@@ -378,6 +378,30 @@ def test_steps_that_no_file_has_are_refused(
         Liquid.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda header: header["times"].__setitem__(1, float("nan")),
+        lambda header: header.update(times=header["times"][::-1]),
+        lambda header: header.update(times=[]),
+        lambda header: header["grid"].update(voxel=float("nan")),
+        lambda header: header["grid"].update(voxel=-1.0),
+        lambda header: header["grid"].update(origin=[0.0, float("inf"), 0.0]),
+        lambda header: header["decoder"].update(opacity_slope=float("nan")),
+    ],
+)
+def test_numbers_that_no_model_has_are_refused(
+    fitted: tuple[FittedSplashSplat, Run], tmp_path: Path, change: Callable[[dict], object]
+) -> None:
+    """They would become indices of kernels, which read where there is nothing."""
+    fitted[0].liquid.save(tmp_path)
+    header = json.loads((tmp_path / "liquid.json").read_text())
+    change(header)
+    (tmp_path / "liquid.json").write_text(json.dumps(header))
+    with pytest.raises(SplashbenchError, match=r"liquid.json is not a SplashSplat model"):
+        Liquid.load(tmp_path)
+
+
 def uncoded(liquid: Liquid, directory: Path, version: int) -> None:
     """`liquid` as format 6 has it: the numbers themselves. version: what its header says."""
     liquid.save(directory)
