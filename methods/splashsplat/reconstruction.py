@@ -111,10 +111,11 @@ def fit_liquid(
         fit = _fit(
             beginning, traced, backgrounds, run, span, None if offer is None else offer_state, settled, _clock(run)
         )
-    appearance, look = beginning.appearance, beginning.look
+    appearance = beginning.appearance
     memory.forget()  # what comes has other sizes
     if keep is not None and fit is not None:
-        keep(Learned(traced.track, appearance, look))
+        keep(Learned(traced.track, appearance, beginning.look))
+    del beginning  # large: its photographs go with the fit, and nobody asks again how they look
     if fit is not None and fit.earned:
         run.decide(iterations_decision(fit.earned, fit.begun + len(fit.losses)))
     if fit is None:

@@ -248,6 +248,11 @@ class Silhouettes:
             return distance
         return blended(distance, self._frame_distance(view, second, window), share)
 
+    def inside(self, view: int, t: int) -> np.ndarray:
+        """Where `distance` of the view's window is below 0, bool; without computing it where no masks are blended."""
+        first, _, share = self._between[view][t]
+        return self.evidence_mask(view, first) if share == 0 else self.distance(view, t) < 0
+
     def sequence_distance(self, view: int, window: ImageWindow | None = None) -> np.ndarray:
         """2-D signed distance to everything that view number `view` ever sees as liquid, of `window`."""
         return self._distance(view, self.sequence_mask(view), window)

@@ -50,9 +50,7 @@ def _absurd(camera: Camera) -> str:
     """What is wrong with one camera; empty where nothing is."""
     fx, fy = camera.K[0, 0], camera.K[1, 1]
     if abs(camera.K[0, 1]) > _ROUNDING * fx:
-        return (
-            "K has skew, which no lens has and no renderer here draws; undistort its images to a plain pinhole"
-        )
+        return "K has skew, which no lens has and no renderer here draws; undistort its images to a plain pinhole"
     for side, focal in ((camera.width, fx), (camera.height, fy)):
         angle = 2 * np.degrees(np.arctan(side / (2 * focal)))
         if not VIEW_DEGREES[0] <= angle <= VIEW_DEGREES[1]:

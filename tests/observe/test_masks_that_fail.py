@@ -9,7 +9,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.observe import Silhouettes, distrust_failed_masks, sequence_bounds, signed_distance_fields
 from splashbench.observe.failures import missing_shares
 from splashbench.observe.silhouettes import blended, signed_distance_2d
-from splashbench.scene import Camera, look_at
+from splashbench.scene import Camera, Scene, look_at
 
 FOCAL, WIDTH, HEIGHT = 260.0, 160, 120
 
@@ -166,3 +166,18 @@ def test_masks_are_kept_as_bits() -> None:
     silhouettes = Silhouettes(scene)
     assert silhouettes.nbytes < scene.n_frames * 5 * WIDTH * HEIGHT / 8 + 1000
     np.testing.assert_array_equal(silhouettes.mask(0, 3), scene.mask("0", 3))
+
+
+def test_what_is_inside_is_where_the_distance_is_below_zero(balls: Scene) -> None:
+    """Of masks as they are, that failed, that are empty or full, and blended between two frames."""
+    training = balls.training()
+    silhouettes = Silhouettes(training)
+    failed = np.zeros((training.n_frames, len(silhouettes.views)), dtype=bool)
+    failed[2, 1] = failed[3, 0] = failed[0, 2] = True
+    silhouettes.distrust(failed)
+    silhouettes._packed[3][4][:] = 0
+    silhouettes._packed[3][5][:] = 255
+    silhouettes._between[4][1] = (1, 2, 0.4)
+    for view in range(len(silhouettes.views)):
+        for t in range(training.n_frames):
+            np.testing.assert_array_equal(silhouettes.inside(view, t), silhouettes.distance(view, t) < 0)

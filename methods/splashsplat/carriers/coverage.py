@@ -126,6 +126,6 @@ def uncovered_by_any(
     points = [np.zeros((0, 3), np.float32)]
     for view, (camera, depth) in enumerate(zip(silhouettes.cameras, container_depths)):
         if not silhouettes.failed_masks[t, view]:
-            mask = silhouettes.distance(view, t) < 0
+            mask = silhouettes.inside(view, t)
             points.append(uncovered(phi, grid, camera, mask, silhouettes.windows[view], depth, reach, scale))
     return np.concatenate(points)

@@ -40,7 +40,8 @@ class GravityCues:
     container_depths: list[np.ndarray | None]
 
     def refined(self, phi: np.ndarray, grid: Grid, t: int) -> np.ndarray:
-        """The hull's distance `phi` of frame `t` on `grid` (voxels), with a full pool and without what floats on it."""
+        """The hull's distance `phi` of frame `t` on `grid` (voxels), with a full pool and without what floats on it;
+        it is changed in place."""
         if self.pool is None or not np.isfinite(self.levels[t]):
             return phi
         return self.pool.lowered(phi, grid, float(self.levels[t]), self.container_depths, self.jets[t])

@@ -105,8 +105,8 @@ class LiquidPool:
         container_depths: Sequence[np.ndarray | None],
         jet: Jet | None = None,
     ) -> np.ndarray:
-        """`phi` (hull distance on `grid`, voxels) with a full pool up to `level` and without what every view explains
-        by it: float32 of the same shape.
+        """`phi` (hull distance on `grid`, voxels, float32) with a full pool up to `level` and without what every view
+        explains by it: changed in place, as it is large, and returned.
 
         container_depths: per view the container's depth image, None where it hides nothing (observe/container.py).
         jet: what falls into the pool is no phantom.
@@ -114,8 +114,8 @@ class LiquidPool:
         if self._room is None or self._room.grid is not grid:
             self._room = _Room.of(self.vessel, grid)
         room = self._room
-        settled = phi.copy()
-        flat = settled.reshape(-1)
+        phi = np.ascontiguousarray(phi)
+        flat = phi.reshape(-1)
         doubtful = np.nonzero(flat < _NEAR)[0]
         points = grid.to_scene(np.stack(np.unravel_index(doubtful, grid.shape), axis=1))
         above = ((self.vessel.height(points) - level) / grid.voxel).astype(np.float32)
@@ -140,7 +140,7 @@ class LiquidPool:
         below = room.nodes[: np.searchsorted(room.heights, level + _NEAR * grid.voxel)]
         pool = np.maximum((room.heights[: len(below)] - level) / grid.voxel, room.distance[: len(below)])
         flat[below] = np.minimum(flat[below], pool.astype(np.float32))
-        return settled
+        return phi
 
 
 @dataclass(frozen=True)

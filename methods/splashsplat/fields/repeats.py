@@ -33,5 +33,7 @@ def repeated_frames(scene: TrainingScene, silhouettes: Silhouettes) -> np.ndarra
 def _same(scene: TrainingScene, name: str, t: int) -> bool:
     """Whether the liquid looks as it did. What lies around it stands still anyway, and would hide that it does not."""
     mask = scene.mask(name, t)
+    if not mask.any():
+        return True
     now, before = scene.image(name, t)[mask], scene.image(name, t - 1)[mask]
-    return not mask.any() or float(np.abs(now.astype(np.int16) - before).mean()) <= _SAME_LEVELS
+    return float(np.abs(now.astype(np.int16) - before).mean()) <= _SAME_LEVELS

@@ -93,10 +93,10 @@ def open_shares(solid: np.ndarray, shares: np.ndarray, start: int, stop: int) ->
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def extrapolate(velocity: np.ndarray, has_velocity: np.ndarray, layers: int, start: int, stop: int) -> None:
-    """Carries components start..stop `layers` faces beyond those with known = 1; what is farther becomes 0.
+    """Carries components start..stop `layers` faces beyond those where it is known; what is farther becomes 0.
 
-    Each new face takes the mean of the known ones among its six neighbours. known: uint8, shape of velocity; faces
-    that got a value become 1.
+    Each new face takes the mean of the known ones among its six neighbours. has_velocity: uint8, shape of velocity, 1
+    where known; faces that got a value become 1.
     """
     for a in range(start, stop):
         field, mark = velocity[a], has_velocity[a]

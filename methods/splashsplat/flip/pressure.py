@@ -215,7 +215,7 @@ def apply_pressure(
     pressure: np.ndarray,
     has_velocity: np.ndarray,
 ) -> None:
-    """Subtracts the pressure gradient on the open faces of the liquid cells, in place, and marks them 1 in `known`."""
+    """Subtracts the pressure gradient on the open faces of the liquid cells, in place; marks them in has_velocity."""
     place = np.empty(3, np.int64)
     for n in range(len(cells)):
         for side in range(6):

@@ -1,5 +1,5 @@
 """FLIP: liquid simulated from one observed state on, the paper's ablation "FLIP" ("Ablation Study"; supplement,
-"One-FrameStep Solver Comparison").
+"One-Step Solver Comparison").
 
 A FLIP/PIC solver (Zhu and Bridson 2005) with gravity, the container's walls and a free surface, and nothing that the
 images do not show: no inflow, no viscosity, no surface tension. It needs the scene's gravity, its metric scale and the

@@ -323,7 +323,7 @@ def test_the_dome_over_a_pool_goes_and_the_pool_is_full(poured):
     grid = Grid.over(sequence_bounds(silhouettes, container).padded(0.1), 56)
     phi = carve_frame(silhouettes, grid, 0)
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    settled = LiquidPool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi, grid, 0.06, depths)
+    settled = LiquidPool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi.copy(), grid, 0.06, depths)
     points = grid.nodes()
     truth = (np.abs(points[..., 0]) < 0.1) & (np.abs(points[..., 2]) < 0.08) & (points[..., 1] > 0)
     truth &= points[..., 1] < 0.06
@@ -345,7 +345,7 @@ def test_what_falls_into_the_pool_is_kept(poured):
     phi = np.full(grid.shape, -5, np.float32)
     pool = LiquidPool(Vessel.of(poured.mesh, DOWN), silhouettes, True)
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    low, kept = pool.lowered(phi, grid, 0.06, depths), pool.lowered(phi, grid, 0.06, depths, jet)
+    low, kept = pool.lowered(phi.copy(), grid, 0.06, depths), pool.lowered(phi.copy(), grid, 0.06, depths, jet)
     node = tuple(np.round(grid.to_voxels(np.array([0.0, 0.09, 0.0]))).astype(int))
     assert low[node] > 0 > kept[node]
 
