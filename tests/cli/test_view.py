@@ -122,7 +122,7 @@ def test_a_port_that_is_in_use_is_one_line(balls_directory: Path, fails: Fails) 
         (["nowhere"], "nowhere is not a folder; give the folder of a scene or of a submission"),
         (["--camera", "9", "--screenshot", "a.png"], "has no camera '9'; choose one of 1, 2, 3, 4, 5, 6, 7"),
         (["--show", "water", "--no-open"], "there is no layer 'water'; choose of points, particles, surface"),
-        (["--screenshot", "a.jpg"], "a.jpg would be written as PNG; end its name in .png"),
+        (["--screenshot", "a.jpg"], "a.jpg: the picture is a PNG; give a name that ends in .png"),
         (["--host", "no such host", "--no-open"], "no such host is no address"),
     ],
 )

@@ -86,7 +86,11 @@ def _put(store: Store, run: PlannedRun, psnr: float | None, mixed: bool) -> None
         status="crashed" if psnr is None else "ok",
         reason="it | broke" if psnr is None else "",
         protocol=PROTOCOL_V1,
-        digests=Digests(scene="0" * 64, submission=hashlib.sha256(run.digest.encode()).hexdigest(), protocol="0" * 64),
+        digests=Digests(
+            scene="0" * 64,
+            submission=hashlib.sha256(run.digest.encode()).hexdigest(),
+            protocol=PROTOCOL_V1.digest,
+        ),
         metrics={name: metric_value(name, values.get(name), f"no {name}") for name in METRICS},
         hardware={"cpu": "test processor", "cores": 2},
         mixed=mixed,
