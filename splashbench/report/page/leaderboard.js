@@ -216,7 +216,7 @@ function drawSummary() {
   head.append(element("th", "method"), element("th", "runs"), ...shown.map(name => element("th", data.metrics[name].label)), element("th", "hypervolume"));
   const cell = (found, digits, runs) => {
     const made = element("td", found ? number(found.value, digits) : "–");
-    if (found && found.runs < runs) made.append(element("small", `of ${found.runs} of ${runs} runs`));
+    if (found && found.runs < runs) made.append(element("small", `${found.runs} of ${runs} runs`));
     if (found && found.interval) made.append(element("small", `${number(found.interval[0], digits)} to ${number(found.interval[1], digits)}`));
     return made;
   };
