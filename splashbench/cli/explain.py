@@ -45,12 +45,13 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench explain`."""
+    from splashbench.files import require_unsealed_place
     from splashbench.report.decision_chart import require_chart_place
-    from splashbench.submission import Submission, require_outside
+    from splashbench.submission import Submission
 
     if arguments.out:
         require_chart_place(arguments.out)
-        require_outside(arguments.out, arguments.submission)
+        require_unsealed_place(arguments.out)
     submission = Submission.open(arguments.submission, verify=False)
     identity, record = submission.identity, submission.record
     for paragraph in _text(submission):

@@ -54,15 +54,14 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench restyle`."""
     from splashbench.dyes import dye_named
-    from splashbench.files import require_folder_place
+    from splashbench.files import require_folder_place, require_unsealed_place
     from splashbench.replay import load
     from splashbench.restyle import filmed_dye, restyled
     from splashbench.restyle.pictures import filmed_facts, write_restyled
-    from splashbench.submission import require_outside
 
     dye = dye_named(arguments.dye)
     require_folder_place(arguments.out)
-    require_outside(arguments.out, arguments.submission)
+    require_unsealed_place(arguments.out)
     reconstruction = load(arguments.submission, scene=arguments.scene)
     views = list(dict.fromkeys(arguments.view or reconstruction.test))
     for name in views:

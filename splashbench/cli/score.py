@@ -70,11 +70,11 @@ def register(subparsers: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle `splashbench score`."""
-    from splashbench.files import require_folder_place, require_picture_place
+    from splashbench.files import require_folder_place, require_picture_place, require_unsealed_place
     from splashbench.report.result_sheet import write_result_sheet
     from splashbench.scene import Scene
     from splashbench.score import score_submission, shared_fields
-    from splashbench.submission import Submission, require_outside
+    from splashbench.submission import Submission
 
     if arguments.verify:
         return verify_results(arguments)
@@ -83,12 +83,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.look_in:
         arguments.usage_error("--submissions is for --verify; add it")
     protocol = _protocol(arguments.changes)
-    sealed = [*arguments.submissions, *([arguments.reference] if arguments.reference else [])]
     require_folder_place(arguments.out)
-    require_outside(arguments.out, *sealed)
+    require_unsealed_place(arguments.out)
     if arguments.sheet:
         require_picture_place(arguments.sheet, arguments.scene)
-        require_outside(arguments.sheet, *sealed)
     scene = Scene.open(arguments.scene)
     # All are opened, hence verified, first: scoring may take hours.
     submissions = [Submission.open(path) for path in arguments.submissions]

@@ -150,8 +150,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.video.output import rate_for, require_place
 
     _require_sense(arguments)
-    folders = [arguments.submission, *map(Path, _others(arguments))]
-    require_place(arguments.out, arguments.replace, folders)
+    require_place(arguments.out, arguments.replace)
     reconstruction = load(arguments.submission, arguments.scene, method=arguments.method)
     if arguments.dye is not None:
         from splashbench.dyes import dye_named
@@ -187,12 +186,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({"out": str(arguments.out), **about})
     return 0
-
-
-def _others(arguments: argparse.Namespace) -> list[str]:
-    """Folders of the submissions that are compared with."""
-    named = arguments.beside or ([arguments.wipe] if arguments.wipe is not None else [])
-    return [name for name in named if name != _TRUTH]
 
 
 def _comparison(arguments: argparse.Namespace, shown: Reconstruction) -> Comparison:

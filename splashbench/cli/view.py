@@ -87,20 +87,13 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.usage_error("--camera is for --screenshot; in the browser choose one in the panel")
     if arguments.screenshot and len(arguments.places) == 2 and arguments.size[0] % 2:
         arguments.usage_error(f"--size: a width of {arguments.size[0]} does not halve; give an even one for two halves")
-    from splashbench.submission import IDENTITY, require_outside
+    from splashbench.files import require_folder_place, require_picture_place, require_unsealed_place
 
-    sealed = [place for place in arguments.places if (place / IDENTITY).is_file()]
-    for output in (arguments.screenshot, arguments.save_to):
-        if output is not None:
-            require_outside(output, *sealed)
     if arguments.screenshot:
-        from splashbench.files import require_picture_place
-
         require_picture_place(arguments.screenshot, *arguments.places)
     if arguments.save_to:
-        from splashbench.files import require_folder_place
-
         require_folder_place(arguments.save_to)
+        require_unsealed_place(arguments.save_to)
     from splashbench.viewer.server import is_loopback, require_viser
 
     require_viser()

@@ -17,9 +17,8 @@ from pydantic import BaseModel, ConfigDict
 
 from splashbench.errors import SplashbenchError
 from splashbench.export.placement import Placement, Up
-from splashbench.files import atomic_directory, write_model
+from splashbench.files import atomic_directory, require_unsealed_place, write_model
 from splashbench.replay import Reconstruction
-from splashbench.submission import require_outside
 from splashbench.version import __version__
 
 #: The file by which an export is recognised.
@@ -69,10 +68,10 @@ class Manifest(BaseModel):
 def export_folder(reconstruction: Reconstruction, out: Path | str, replace: bool) -> Iterator[Path]:
     """Yield a folder to write into; success makes it `out`, failure leaves nothing.
 
-    Raises SplashbenchError where `out` holds something else than an earlier export, or lies in the submission.
+    Raises SplashbenchError where `out` holds something else than an earlier export, or lies in a submission.
     """
     out, submission = Path(out), reconstruction.submission.directory
-    require_outside(out, submission)
+    require_unsealed_place(out)
     inputs = [submission, *([reconstruction.scene.directory] if reconstruction.scene else [])]
     with atomic_directory(out, replace, holds=MANIFEST, keys=Manifest.model_fields, inputs=inputs) as staging:
         yield staging

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splashbench.errors import SplashbenchError
 
-#: Files that a submission has, and nothing else.
+# What a finished submission has, and no other folder.
 _SEALED = ("submission.toml", "SHA256SUMS")
 
 

@@ -125,14 +125,15 @@ def _panel(axes: Axes, row: Machine, name: str, looks: dict[str, tuple[str, str]
         if entry.label in summaries:
             mean = summaries[entry.label]
             _draw_entry(axes, entry, mean, name, looks[entry.label], largest, row.reported)
-            if not entry.compares:
-                notes = [f"{len(entry.scenes)} of {row.n_scenes} scenes"] if entry.shared is None else []
-                note = ", ".join([*notes, *([f"{entry.failed} failed"] if entry.failed else [])])
+            notes = [f"{len(entry.scenes)} of {row.n_scenes} scenes"] if entry.shared is None else []
+            notes += [f"{entry.failed} failed"] if entry.failed else []
+            if notes:
+                note = ", ".join(notes)
                 axes.annotate(
                     note, (mean.seconds.value, mean.value.value), (9, 5), textcoords="offset points", fontsize=7.5
                 )
     # Other scenes, or those alone on which it did not fail, may be the easy ones.
-    comparing = [summaries[e.label] for e in row.entries if e.compares and e.label in summaries]
+    comparing = [summaries[e.label] for e in row.entries if e.compares(name) and e.label in summaries]
     if comparing:
         _draw_front(axes, [(s.seconds.value, s.value.value) for s in comparing], higher)
     axes.set_xscale("log")

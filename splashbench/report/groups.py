@@ -87,7 +87,7 @@ def groups(sources: Sequence[ResultFile]) -> list[Group]:
     for source in sources:
         result = source.result
         by_key[result.hardware_label, result.protocol_label, told_text(result.told)].append(result)
-        if result.method == NOTHING and result.status == "ok":
+        if result.method == NOTHING and result.control and result.status == "ok":
             backgrounds[result.digests.scene, result.protocol_label].append(result)
     return [_group(results, backgrounds) for _, results in sorted(by_key.items())]
 

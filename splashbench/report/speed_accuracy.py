@@ -42,10 +42,12 @@ class ChartedMethod:
     shared: frozenset[str] | None = None
     failed: int = 0
 
-    @property
-    def compares(self) -> bool:
-        """Whether its mean may stand on a front: over the same scenes as others', with no run left out."""
-        return self.shared is not None and not self.failed
+    def compares(self, name: str) -> bool:
+        """Whether its mean of metric `name` may stand on a front: over the same scenes as others', no run left out."""
+        shared = self.shared
+        if shared is None or self.failed:
+            return False
+        return all(name in dot.values for dot in self.dots if dot.scene in shared)
 
     @property
     def scenes(self) -> set[str]:

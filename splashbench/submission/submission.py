@@ -171,13 +171,6 @@ class Submission(Views):
         return SignedDistance.load(path) if path.is_file() else None
 
 
-def require_outside(out: Path, *submissions: Path) -> None:
-    """Raise SplashbenchError where `out` lies in one of `submissions`: a file that is added there breaks its seal."""
-    for submission in submissions:
-        if Path(out).resolve().is_relative_to(Path(submission).resolve()):
-            raise SplashbenchError(f"{out} lies in {submission}, whose files are sealed; give a place outside it")
-
-
 def integrity_faults(directory: Path) -> list[str]:
     """A line for every file that was changed, is missing, was added, or is no plain file."""
     directory = Path(directory)

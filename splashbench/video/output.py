@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,10 +14,10 @@ from splashbench.files import (
     atomic_path,
     require_file_place,
     require_folder_place,
+    require_unsealed_place,
     write_json,
 )
 from splashbench.progress import track
-from splashbench.submission import require_outside
 from splashbench.video.encoders import Encoder, PngFolder, encode_gif, encode_mp4, gif_rate
 from splashbench.video.film import Film
 
@@ -38,13 +38,13 @@ def is_folder(out: Path) -> bool:
     return not ending
 
 
-def require_place(out: Path, replace: bool, submissions: Sequence[Path]) -> None:
-    """Raise SplashbenchError where no video of `submissions` can be written at `out`: asked before long work.
+def require_place(out: Path, replace: bool) -> None:
+    """Raise SplashbenchError where no video can be written at `out`: asked before long work.
 
     replace: whether what is there may go.
     """
     folder = is_folder(out)
-    require_outside(out, *submissions)
+    require_unsealed_place(out)
     if folder:
         require_folder_place(out)
         if out.is_dir() and any(out.iterdir()) and not replace:
@@ -84,7 +84,7 @@ def write_video(film: Film, out: Path, replace: bool = False) -> None:
 @contextmanager
 def _encoder(film: Film, out: Path, replace: bool) -> Iterator[Encoder]:
     """What writes the frames of `film` to `out`."""
-    require_place(out, replace, film.submissions)
+    require_place(out, replace)
     width, height = film.size
     if max(width, height) > MAX_SIDE:
         raise SplashbenchError(f"the video would be {width}x{height}, more than {MAX_SIDE} a side; give a --resize")

@@ -160,12 +160,16 @@ def test_the_front_is_of_methods_that_ran_on_the_same_scenes_without_failure(mak
     results += [make_result("crasher", 0, scene, "crashed", "no memory") for scene in "bc"]
     results.append(make_result("picky", 0, "easy", psnr=28.0, fit_seconds=30.0))
     (machine,) = machines([ResultFile(f"{n}.json", result) for n, result in enumerate(results)])
-    assert {entry.label: entry.compares for entry in machine.entries} == {
+    assert {entry.label: entry.compares("psnr") for entry in machine.entries} == {
         "whole": True,
         "crasher": False,
         "picky": False,
     }
     assert machine.n_scenes == 3
+    # A figure that one of its scenes lacks is a mean over others, too.
+    whole = next(entry for entry in machine.entries if entry.label == "whole")
+    del whole.dots[0].values["psnr"]
+    assert not whole.compares("psnr")
     picky = next(entry for entry in machine.entries if entry.label == "picky")
     assert picky.shared is None
     assert picky.summary("psnr") is not None

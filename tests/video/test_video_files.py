@@ -166,9 +166,12 @@ def test_places_where_no_video_can_be(tmp_path: Path) -> None:
         ("folder.mp4", "is a folder"),
     ):
         with pytest.raises(SplashbenchError, match=fault):
-            require_place(tmp_path / out, True, [])
+            require_place(tmp_path / out, True)
+    for name in ("submission.toml", "SHA256SUMS"):
+        require_place(tmp_path / "folder.mp4" / "deep" / "x.mp4", True)
+        (tmp_path / "folder.mp4" / name).touch()
     with pytest.raises(SplashbenchError, match="whose files are sealed"):
-        require_place(tmp_path / "folder.mp4" / "deep" / "x.mp4", True, [tmp_path / "folder.mp4"])
+        require_place(tmp_path / "folder.mp4" / "deep" / "x.mp4", True)
 
 
 class Broken(Exception):
