@@ -21,8 +21,10 @@ from splashbench.processes import end_with_parent
 _START = "import sys; sys.path[:] = sys.argv[1].split({separator!r}); del sys.argv[1]; {then}"
 _TASK = "from splashbench.child import main; sys.exit(main(*sys.argv[1:]))"
 _TOOL = "from splashbench.cli.main import main; sys.exit(main())"
-#: Exit code of a child that could not write; the last line of its log says which file.
+#: Exit code of a child that could not write; the last line of its log says which file, behind _DISK_FULL: a method's
+#: own code may end its process with this number, too.
 DISK_FULL_EXIT = 28
+_DISK_FULL = "splashbench: the disk is full: "
 
 
 def child_command(task: Callable[..., int], *arguments: str | Path) -> list[str]:
@@ -43,8 +45,12 @@ def _start(then: str) -> list[str]:
 
 def raise_if_disk_was_full(exit_code: int | None, log: Sequence[str]) -> None:
     """Raise DiskFullError where a child ended for that; `log`: the last lines that it wrote."""
-    if exit_code == DISK_FULL_EXIT:
-        raise DiskFullError(log[-1] if log else "the disk is full; free some space")
+    if exit_code != DISK_FULL_EXIT:
+        return
+    if not log:  # there was no room for its line
+        raise DiskFullError("the disk is full; free some space")
+    if log[-1].startswith(_DISK_FULL):
+        raise DiskFullError(log[-1].removeprefix(_DISK_FULL))
 
 
 def main(parent: str, task: str, *arguments: str) -> int:
@@ -54,6 +60,6 @@ def main(parent: str, task: str, *arguments: str) -> int:
     try:
         exit_code: int = getattr(import_module(module), function)(*arguments)
     except DiskFullError as error:  # no task's own failure: the parent reads this last line and tells the user
-        print(error, file=sys.stderr)
+        print(f"{_DISK_FULL}{error}", file=sys.stderr)
         return DISK_FULL_EXIT
     return exit_code

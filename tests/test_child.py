@@ -44,6 +44,7 @@ def test_a_full_disk_is_an_exit_code_and_a_line_that_the_parent_raises_again(tmp
     with pytest.raises(DiskFullError, match=r"^model.npz could not be written$"):
         raise_if_disk_was_full(done.returncode, done.stderr.splitlines())
     raise_if_disk_was_full(1, ["another fault"])
+    raise_if_disk_was_full(DISK_FULL_EXIT, ["curl: (28) Operation timed out"])
     with pytest.raises(DiskFullError, match="free some space"):
         raise_if_disk_was_full(DISK_FULL_EXIT, [])
 

@@ -2,8 +2,10 @@
 
 import errno
 import hashlib
+import io
 import os
 import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -25,6 +27,7 @@ from splashbench.files import (
     tree_bytes,
     write_image,
     write_json,
+    write_npz,
     write_png,
 )
 
@@ -175,6 +178,47 @@ def test_what_is_no_array_in_an_archive_is_named(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.npy", b"not an array")
     with pytest.raises(SplashbenchError, match=r"odd\.npz: a is not an array"):
+        read_npz(path, {"a": 1})
+
+
+def test_a_bzipped_bomb_is_unpacked_no_further_than_it_is_read(tmp_path: Path) -> None:
+    """zipfile unpacks whatever the packed bytes hold that it has read: a block of 40 bytes holds 46 MB."""
+    path, true, claimed = tmp_path / "bomb.npz", 184_000_000, 8 * 100 + 128
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("a.npy", bytes(true))
+    content = path.read_bytes()
+    assert len(content) < 2000
+    path.write_bytes(content.replace(struct.pack("<I", true), struct.pack("<I", claimed)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(SplashbenchError, match=r"bomb\.npz: a is not an array"):
+            read_npz(path, {"a": 1})
+        assert tracemalloc.get_traced_memory()[1] < 30_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_bzipped_arrays_that_are_damaged_or_longer_than_stated_are_refused(tmp_path: Path) -> None:
+    path, array = tmp_path / "a.npz", np.random.default_rng(0).integers(0, 255, 5000).astype(np.uint8)
+    write_npz(path, {"a": array})
+    np.testing.assert_array_equal(read_npz(path, {"a": 1})["a"], array)
+    with zipfile.ZipFile(path) as archive:
+        entry = archive.infolist()[0]
+    content = path.read_bytes()
+    other_sum = content.replace(struct.pack("<I", entry.CRC), struct.pack("<I", entry.CRC ^ 1))
+    assert other_sum != content
+    path.write_bytes(other_sum)
+    with pytest.raises(SplashbenchError, match=r"a\.npz is not a readable .npz .*is damaged"):
+        read_npz(path, {"a": 1})
+    longer = np.lib.format.header_data_from_array_1_0(array)
+    with io.BytesIO() as stream:
+        np.lib.format.write_array_header_1_0(stream, longer)
+        header = stream.getvalue()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("a.npy", header + array.tobytes() + b"more")
+    true, stated = len(header) + len(array) + 4, len(header) + len(array)
+    path.write_bytes(path.read_bytes().replace(struct.pack("<I", true), struct.pack("<I", stated)))
+    with pytest.raises(SplashbenchError, match=r"a\.npz is not a readable .npz .*is damaged"):
         read_npz(path, {"a": 1})
 
 

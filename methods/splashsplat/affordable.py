@@ -26,8 +26,8 @@ _LONGER, _EXPONENT = 1.35, 2.15
 _BEFORE = 0.4
 # Below so many seconds there is the draft's background, below so many `quick`'s.
 _DRAFT_BACKGROUND, _QUICK_BACKGROUND = 45.0, 120.0
-# Seconds from which self-calibration, which takes 2 to 5 at 240x160, is no large part of a fit.
-_SELF_CALIBRATION = 30.0
+# Seconds from which self-calibration is no large part of a fit: it takes 2 to 5 at 240x160, and 36 to 49 at 1200x1800.
+_SELF_CALIBRATION, _SELF_CALIBRATION_MEGAPIXEL = 30.0, 125.0
 # Bytes of a background anchor as it is stored, and the share of a byte budget for all of them.
 _ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25
 # Bytes of a carrier's values, about; a track that takes more than this much of its room is traced anew, coarser.
@@ -46,17 +46,19 @@ class Affordable:
     traced: Traced | None = None
 
 
-def affords_self_calibration(run: Run) -> bool:
+def affords_self_calibration(scene: TrainingScene, run: Run) -> bool:
     """Whether the budget of seconds leaves time to look for clocks, cameras, exposures and masks that are off."""
     seconds = run.budget.seconds
-    affords = seconds is None or seconds >= _SELF_CALIBRATION
+    megapixels = max(camera.width * camera.height for camera in scene.cameras.values()) / 1e6
+    least = max(_SELF_CALIBRATION, _SELF_CALIBRATION_MEGAPIXEL * megapixels)
+    affords = seconds is None or seconds >= least
     if not affords:
         run.decide(
             Decision(
                 name="self-calibration",
                 basis="budget",
                 chosen="left out",
-                because=f"{seconds:g} s are to be kept, and it is worth its time from {_SELF_CALIBRATION:g} s on",
+                because=f"{seconds:g} s are to be kept, and it is worth its time from {least:.0f} s on",
             )
         )
     return affords
@@ -101,6 +103,8 @@ def within_seconds(
     )
     if chosen is None:
         longer = traced.config.model_copy(update={"iterations": config.iterations})
+        if run.budget.storage_bytes is not None:  # how little may be stored is measured then, too
+            longer = longer.model_copy(update={"storage_tolerance": config.storage_tolerance})
         return Affordable(longer, replace(traced, config=longer))
     return Affordable(with_cells(config, chosen))
 

@@ -117,7 +117,7 @@ class Course:
     def _calibrate(self) -> None:
         """From now on the scene as it is found to be."""
         run = self._run
-        if not self._config.self_calibration or (self._masked and not affords_self_calibration(run)):
+        if not self._config.self_calibration or (self._masked and not affords_self_calibration(self._scene, run)):
             return
         with run.stage("self-calibration"):
             found = self_calibration(self._scene, self._plates, lambda what: run.progress(0, what))

@@ -35,9 +35,9 @@ from .storage.earlier import EARLIER, UNSORTED, read_earlier
 from .storage.looks import appearance_arrays, learned_values, read_appearance
 from .storage.track import carrier_arrays, motion_arrays, read_track
 
-# Step in which values are stored where nothing is known of the photographs, of their spread.
-_UNKNOWN_STEP = 0.05
-# Of a decoder, before it is made: a header may ask for any size.
+#: Step in which values are stored where nothing is known of the photographs, of their spread.
+UNKNOWN_STEP = 0.05
+# Of a decoder and of control cells in voxels, before they are made: a header may ask for any size.
 _WIDEST = 4096
 # Nodes of the transport grid between those of a velocity field that is handed out: u_t is coarser still.
 _NODES_APART = 2
@@ -46,8 +46,13 @@ _NODES_APART = 2
 def _factor(stored: int | list[float]) -> Factor:
     """Transport voxels per control cell, as liquid.json has them."""
     if not isinstance(stored, list):
-        return int(stored)
+        factor = int(stored)
+        if not 0 < factor <= _WIDEST:
+            raise ValueError(f"its factor is not between 1 and {_WIDEST}")
+        return factor
     fx, fy, fz = (float(width) for width in stored)
+    if not all(0 < width <= _WIDEST for width in (fx, fy, fz)):  # false for NaN as well
+        raise ValueError(f"its factors are not above 0 and at most {_WIDEST}")
     return fx, fy, fz
 
 
@@ -85,7 +90,7 @@ class Liquid:
         composition: Composition = "over",
         between_frames: BetweenFrames = "both",
         sensitivity: Sensitivity | None = None,
-        step: float = _UNKNOWN_STEP,
+        step: float = UNKNOWN_STEP,
     ) -> Liquid:
         """Bring the appearance to the precision of the files. track: in this precision already, see `stored_track`.
 
@@ -237,6 +242,8 @@ class Liquid:
                 raise SplashbenchError(f"{path}: format {header['format']} is not {FORMAT}; {AGAIN}")
             box = header["grid"]
             nx, ny, nz = (int(n) for n in box["shape"])
+            if min(nx, ny, nz) < 2:
+                raise ValueError("the grid has less than two nodes along an axis")
             grid = Grid(np.array(box["origin"], dtype=np.float64), float(box["voxel"]), (nx, ny, nz))
             if not (grid.origin.shape == (3,) and np.isfinite(grid.origin).all() and 0 < grid.voxel < np.inf):
                 raise ValueError("the grid's origin is not three numbers, or its voxel not above 0")

@@ -29,8 +29,9 @@ from .appearance.warm_start import Learned
 from .beginning import Beginning, begin
 from .carriers.subframe import Track
 from .fields.occlusion import LiquidOcclusion
-from .model import Liquid
+from .model import UNKNOWN_STEP, Liquid
 from .settings import SplashSplatConfig
+from .storage.looks import learned_values
 from .storage.packing import pack_distance, packed_bytes
 from .storage.steps import Storage, Stored
 from .storage.track import carrier_arrays, track_arrays
@@ -122,6 +123,10 @@ def fit_liquid(
         return reconstruction(appearance, np.ones(traced.track.carriers.count, dtype=bool))
     left = shown(appearance, fit.left)
     sensitivity = fit.sensitivity
+    if sensitivity is None and room is not None:
+        # The bytes are to be kept, though nobody looked at how much values matter, or the fit ended before that.
+        sensitivity = Sensitivity.of_spread(learned_values(appearance))
+        fit = replace(fit, sensitivity=sensitivity)
     if sensitivity is None:
         return reconstruction(appearance, left)
     with run.stage("storing"), one_torch_thread():
@@ -145,8 +150,10 @@ def _within_tolerance(
 ) -> Stored:
     """How the carriers `left` (bool [count]) are stored. room: where given, the bytes that the liquid may take."""
     storage = Storage(appearance, left, fit, run.seed)
-    stored, decision = storage.within_tolerance(config.storage_tolerance)
-    run.decide(decision)
+    stored = Stored(left, UNKNOWN_STEP)
+    if config.storage_tolerance > 0:
+        stored, decision = storage.within_tolerance(config.storage_tolerance)
+        run.decide(decision)
     if room is None:
         return stored
     arrays = track_arrays(track, config.carried)

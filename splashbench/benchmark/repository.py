@@ -209,13 +209,14 @@ def result_fault(result: Result, benchmark: Benchmark) -> str:
 
 
 def find_repeats(entries: Sequence[Entry]) -> None:
-    """A run may be handed in once: two entries with one method, settings, scene and seed would push each other out."""
+    """A run may be handed in once: two entries with one method, settings, scene, seed and hints would push each other
+    out."""
     first: dict[tuple[str, ...], str] = {}
     for entry in entries:
         mine: dict[tuple[str, ...], str] = {}
         for name, result in entry.results.items():
             run = (result.method, result.preset, result.settings_digest, str(result.seed))
-            key = (*run, result.digests.scene, result.hardware_label)
+            key = (*run, result.digests.scene, result.hardware_label, str(result.told))
             other = first.get(key) or mine.get(key)
             if other is not None:
                 entry.faults.append(

@@ -195,6 +195,12 @@ def add_study_runs(parser: argparse._ActionsContainer, lost: str, first: str) ->
         "(default: all runs)",
     )
     parser.add_argument("--retry", action="store_true", help="repeat failed runs")
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu"),
+        default="auto",
+        help="auto: a GPU for the methods that can use one, where there is one with gsplat (default: auto)",
+    )
 
 
 def add_run_options(parser: argparse._ActionsContainer, automatic_device: bool = False) -> None:

@@ -212,6 +212,7 @@ def _score_the_rest(entries: list[Entry], benchmark: Benchmark, place: Path, arg
 
 def _leaderboard(entries: list[Entry], benchmark: Benchmark, place: Path, arguments: argparse.Namespace) -> str:
     """Make SITE/leaderboard of the entries' results; returns its CSV, "" where there is no result."""
+    from splashbench.benchmark.scenes import find_scenes
     from splashbench.cli.main import run_within
     from splashbench.errors import SplashbenchError
 
@@ -226,7 +227,7 @@ def _leaderboard(entries: list[Entry], benchmark: Benchmark, place: Path, argume
     words = ["leaderboard", str(place), str(board), *(["--with-paper"] if benchmark.paper else [])]
     if arguments.scenes:
         folders = [str(entry.folder) for entry in entries if entry.submissions]
-        words += ["--verify", "--scenes", *map(str, arguments.scenes)]
+        words += ["--verify", "--scenes", *map(str, find_scenes([str(path) for path in arguments.scenes]))]
         words += ["--submissions", *folders] if folders else []
         words += ["--lpips-weights", str(arguments.lpips_weights)] if arguments.lpips_weights else []
     if run_within(words):

@@ -27,6 +27,7 @@ Takes six to seven minutes on two shared cores. Read demo_output/README.txt afte
 
 #: Marks the folder of a demo, finished or not.
 _MARK = ".splashbench_demo"
+_MARK_BYTES = 4096
 
 #: id, preset and further options of the runs; the oracle is written by the harness.
 _RUNS: tuple[tuple[str, list[str]], ...] = (
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     start = time.monotonic()
     out: Path = arguments.out
-    _claim(out)
+    _claim(out, arguments.seed, arguments.fresh)
     seed = ["--seed", str(arguments.seed)]
     session, scene, truth, results = out / "session", out / "scene", out / "verify.json", out / "results"
     sheet, runs = out / "contact_sheet.png", {name: out / "submissions" / name for name, _ in _RUNS}
@@ -100,15 +101,36 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if all(gate.passed for gate in gates) else 1
 
 
-def _claim(out: Path) -> None:
-    """Mark `out` as the demo's own: it removes outputs that it makes again, so it must never take another folder."""
-    from splashbench.errors import SplashbenchError
-    from splashbench.files import require_folder_place, write_text
+def _claim(out: Path, seed: int, fresh: bool) -> None:
+    """Mark `out` as the demo's own: it removes outputs that it makes again, so it must never take another folder.
+
+    Raises SplashbenchError for a folder of something else, and without `fresh` for a demo of another seed or version:
+    its outputs would be skipped, and their figures shown as those of this one.
+    """
+    from splashbench.errors import SplashbenchError, one_line
+    from splashbench.files import read_plain, require_folder_place, write_text
 
     require_folder_place(out)
-    if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
+    mark = out / _MARK
+    if out.is_dir() and any(out.iterdir()) and not mark.is_file():
         raise SplashbenchError(f"{out} holds files that are not the demo's; give a new or an empty folder")
-    write_text(out / _MARK, "Made by `splashbench demo`, which may replace everything here.\n")
+    text = f"Made by `splashbench demo`, which may replace everything here.\n{_made_by(seed)}\n"
+    if mark.is_file() and not fresh:
+        made_by = read_plain(mark, _MARK_BYTES).decode("utf-8", "replace").partition("\n")[2].strip()
+        if made_by != _made_by(seed):
+            was = made_by or "an earlier version"
+            raise SplashbenchError(
+                f"{out} holds the demo of {one_line(was)}, and this is {_made_by(seed)}; add --fresh to make all of it "
+                "again, or give another folder"
+            )
+    write_text(mark, text)
+
+
+def _made_by(seed: int) -> str:
+    from splashbench.harness.discovery import load_method
+    from splashbench.version import __version__
+
+    return f"seed {seed}, splashbench {__version__}, splashsplat {load_method('splashsplat').version}"
 
 
 class _Steps:

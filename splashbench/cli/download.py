@@ -6,7 +6,7 @@ import argparse
 import signal
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say, table
@@ -180,9 +180,13 @@ def scenes(arguments: argparse.Namespace) -> int:
     from splashbench.download.archive import ArchiveSource, read_note
     from splashbench.download.containers import add_container_masks, add_containers
     from splashbench.download.scenes import download_scenes
+    from splashbench.manifest import load_scenes
 
     if arguments.url is not None and not arguments.url.startswith(("https://", "http://")):
         arguments.usage_error(f"--url {arguments.url!r} is no address of the web; a file is given by --from")
+    # One word, or DIR behind --from, which takes it for one more source; nothing is fetched into a folder of that name.
+    if str(arguments.out).lower() in map(str.lower, load_scenes()) and not arguments.out.is_dir():
+        _without_folder(arguments)
     source = ArchiveSource.official()
     if arguments.url is not None:
         source = source.mirrored(arguments.url)
@@ -272,6 +276,15 @@ def _little_overlap(cameras: list[str]) -> list[str]:
     return [f"little overlap of mesh and mask in camera {', '.join(cameras)}"] if cameras else []
 
 
+def _without_folder(arguments: argparse.Namespace) -> NoReturn:
+    """Say that DIR, which is the name of a scene, was left out."""
+    arguments.usage_error(
+        f"{arguments.out} is a scene; DIR comes behind the names, and before --from (a folder of this name: "
+        f"{arguments.out.absolute()})"
+    )
+    raise AssertionError  # usage_error ends the program
+
+
 def neurofluid(arguments: argparse.Namespace) -> int:
     """Handle `splashbench download neurofluid`."""
     from splashbench.download.neurofluid import download_neurofluid
@@ -279,10 +292,7 @@ def neurofluid(arguments: argparse.Namespace) -> int:
 
     # One word, or DIR behind --from, which takes it for one more source.
     if not arguments.names and str(arguments.out).lower() in [name.lower() for name in load_neurofluid().scenes]:
-        arguments.usage_error(
-            f"{arguments.out} is a scene; DIR comes behind the names, and before --from (a folder of this name: "
-            f"{arguments.out.absolute()})"
-        )
+        _without_folder(arguments)
     try:
         reports = download_neurofluid(
             arguments.out, arguments.names, arguments.by_hand, tell=say, check_again=arguments.check

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from splashbench.cli.arguments import add_replace, whole_number
 from splashbench.cli.command import add_command, add_group
 from splashbench.cli.output import emit, say, table
+from splashbench.errors import one_line
 
 if TYPE_CHECKING:
     from splashbench.prepare.masks.comparison import MaskChange
@@ -124,8 +125,8 @@ def _row(scene: str, camera: str, change: MaskChange) -> list[str]:
         return "-" if math.isnan(value) else f"{value:.3f}"
 
     return [
-        scene,
-        camera,
+        one_line(scene),
+        one_line(camera),
         str(change.n_masks),
         figure(change.mean_iou),
         figure(change.median_iou),

@@ -106,6 +106,25 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     add_replace(parser, "SCENE")
 
 
+def _require_none_of_a_scene(arguments: argparse.Namespace) -> None:
+    """A usage error for an option that says how a scene is made, which `--init` makes none of."""
+    given = {
+        "--masks": arguments.masks is not None,
+        "--timesteps": arguments.timesteps is not None,
+        "--interval": arguments.interval is not None,
+        "--no-crop": arguments.no_crop,
+        "--image-format": arguments.image_format != "png",
+        "--from": arguments.again_from is not None,
+        "--work": arguments.work is not None,
+    }
+    named = ", ".join(flag for flag, is_given in given.items() if is_given)
+    if named:
+        arguments.usage_error(
+            f"--init makes no scene: {named} would do nothing; write it into session.toml, or give it to "
+            "`splashbench prepare SESSION SCENE`"
+        )
+
+
 def _describe(arguments: argparse.Namespace) -> int:
     """Handle `splashbench prepare SESSION --init`."""
     from splashbench.prepare.init.description import describe
@@ -142,6 +161,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.init:
         if arguments.scene is not None:
             arguments.usage_error("--init writes session.toml and makes no scene; leave SCENE out")
+        _require_none_of_a_scene(arguments)
         return _describe(arguments)
     if arguments.square_metres is not None:
         arguments.usage_error("--square-metres goes with --init")

@@ -77,6 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.submission import Submission
 
     if arguments.verify:
+        for flag, given in (("--out", arguments.out), ("--sheet", arguments.sheet), ("--set", arguments.changes)):
+            if given:
+                arguments.usage_error(f"{flag} is not for --verify, which writes nothing; leave it out")
         return verify_results(arguments)
     if arguments.out is None:
         arguments.usage_error("the following arguments are required: --out")

@@ -138,7 +138,7 @@ def _register_stress(actions: argparse._SubParsersAction) -> None:
 def stress(arguments: argparse.Namespace) -> int:
     """Handle `splashbench study stress`."""
     from splashbench.scene import Scene
-    from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan, claimed, gpu_elsewhere
     from splashbench.study.job import Store
     from splashbench.study.spending import StudyBudget, by_uncertainty
     from splashbench.study.stress import make_stress_plan
@@ -160,6 +160,8 @@ def stress(arguments: argparse.Namespace) -> int:
         levels=arguments.severities or (1, 2, 3, 4, 5),
         seeds=list(dict.fromkeys(arguments.seeds)) or [0],
         timeout_seconds=60 * arguments.timeout if arguments.timeout else None,
+        device=arguments.device,
+        gpu_elsewhere=gpu_elsewhere(arguments.on, arguments.device),
         thin=thin,
     )
     for harm, reason in planned.left_out:
@@ -201,7 +203,9 @@ def _stress_command(arguments: argparse.Namespace) -> str:
         values = getattr(arguments, flag)
         words += [f"--{flag}", *map(str, values)] if values else []
     words += ["--every", str(arguments.every)] if arguments.every > 1 else []
+    words += ["--timeout", f"{arguments.timeout:g}"] if arguments.timeout else []
     words += ["--budget", f"{arguments.budget:g}"] if arguments.budget else []
+    words += ["--device", arguments.device] if arguments.device != "auto" else []
     return shlex.join(words)
 
 

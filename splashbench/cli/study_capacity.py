@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     from splashbench.harness.runner import parse_overrides
     from splashbench.study.capacity import make_capacity_plan, smallest_first
     from splashbench.study.capacity_report import find_knees, knee_text, write_capacity_report
-    from splashbench.study.execution import ExecutionOptions, carry_out_plan
+    from splashbench.study.execution import ExecutionOptions, carry_out_plan, gpu_elsewhere
     from splashbench.study.job import Store
     from splashbench.study.spending import StudyBudget
 
@@ -81,6 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
         base=parse_overrides(arguments.base),
         seeds=list(dict.fromkeys(arguments.seeds)) or [0],
         timeout_seconds=60 * arguments.timeout if arguments.timeout else None,
+        device=arguments.device,
+        gpu_elsewhere=gpu_elsewhere(arguments.on, arguments.device),
     )
     plan, store = capacity.plan, Store(arguments.out)
     say(
@@ -138,4 +140,5 @@ def _command(arguments: argparse.Namespace) -> str:
     words += ["--seeds", *map(str, arguments.seeds)] if arguments.seeds else []
     words += ["--timeout", f"{arguments.timeout:g}"] if arguments.timeout else []
     words += ["--budget", f"{arguments.budget:g}"] if arguments.budget else []
+    words += ["--device", arguments.device] if arguments.device != "auto" else []
     return shlex.join(words)

@@ -47,6 +47,8 @@ def add_machines(parser: argparse.ArgumentParser) -> None:
 
 def machine_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """What `ExecutionOptions` takes of these options."""
+    if arguments.gpus is not None and arguments.on is None:
+        arguments.usage_error("--gpus is for --on; on this machine a run has its GPU without it")
     return {
         "on": arguments.on,
         "jobs": arguments.jobs,

@@ -20,7 +20,8 @@ def verify_results(arguments: argparse.Namespace) -> int:
     from splashbench.score.verification import Evidence
 
     results = [(path, Result.load(path)) for path in arguments.submissions]
-    evidence = Evidence(arguments.look_in, [arguments.scene], arguments.lpips_weights)
+    look_in = [*arguments.look_in, *([arguments.reference] if arguments.reference else [])]
+    evidence = Evidence(look_in, [arguments.scene], arguments.lpips_weights)
     found = []
     for path, result in results:
         say(f"scoring again: {path}: {result.method} on {result.scene}, seed {result.seed}")

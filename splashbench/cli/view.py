@@ -30,6 +30,9 @@ in a checkout: pip install -c constraints.txt -e '.[view]'
 Layers for --show: liquid, background, particles, surface, cut, velocity, picture, container, points, cameras, grid.
 """
 
+_HERE = "127.0.0.1"
+_SIZE = (1200, 800)
+
 
 def register(subparsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
@@ -52,7 +55,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--camera", metavar="NAME", help="with --screenshot: look through this camera")
     parser.add_argument("--show", nargs="+", metavar="LAYER", help="show these layers at first, and no others")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, this machine alone)"
+        "--host", metavar="ADDRESS", help=f"address to listen on (default: {_HERE}, this machine alone)"
     )
     parser.add_argument(
         "--port", type=whole_number(1, 65535), metavar="N", help="port to listen on (default: the first free from 8080)"
@@ -65,7 +68,7 @@ def register(subparsers: argparse._SubParsersAction) -> None:
         "--screenshot", type=Path, metavar="OUT.png", help="write what a headless browser shows, and end"
     )
     parser.add_argument(
-        "--size", type=image_size, default=(1200, 800), metavar="WxH", help="of the screenshot (default: 1200x800)"
+        "--size", type=image_size, metavar="WxH", help="with --screenshot: its size (default: 1200x800)"
     )
 
 
@@ -85,6 +88,12 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.usage_error(f"two can be seen side by side, not {len(arguments.places)}")
     if arguments.camera and not arguments.screenshot:
         arguments.usage_error("--camera is for --screenshot; in the browser choose one in the panel")
+    if arguments.size and not arguments.screenshot:
+        arguments.usage_error("--size is for --screenshot; in the browser the window has the size that you give it")
+    for flag in ("host", "port", "save_to"):
+        if arguments.screenshot and getattr(arguments, flag):
+            arguments.usage_error(f"--{flag.replace('_', '-')} would do nothing with --screenshot; leave it out")
+    arguments.size, arguments.host = arguments.size or _SIZE, arguments.host or _HERE
     if arguments.screenshot and len(arguments.places) == 2 and arguments.size[0] % 2:
         arguments.usage_error(f"--size: a width of {arguments.size[0]} does not halve; give an even one for two halves")
     from splashbench.files import require_folder_place, require_picture_place, require_unsealed_place
@@ -109,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         say("--scene is for submissions, and none was given; it is not used")
     viewer = Viewer(
         exhibits,
-        "127.0.0.1" if arguments.screenshot else arguments.host,
+        arguments.host,
         None if arguments.screenshot else arguments.port,
         send_ahead=False if arguments.screenshot else None,
         on=arguments.show,

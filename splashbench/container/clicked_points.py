@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from splashbench.alignment import triangulate, umeyama
 from splashbench.arrays import Floats
 from splashbench.container.placement import Placement
-from splashbench.container.stance import Axis, Stance, direction
+from splashbench.container.stance import AXES, Axis, Stance, direction
 from splashbench.container.verification import verify
 from splashbench.errors import SplashbenchError
 from splashbench.scene.camera import Camera
@@ -46,7 +46,8 @@ def place_by_points(
     cameras: Sequence[Camera],
     clicks: Sequence[ClickedPoint],
     *,
-    up: Axis = "y",
+    up: Axis | None = None,
+    gravity: Sequence[float] | None = None,
     metres_per_unit: float | None = 1.0,
     masks: Mapping[str, NDArray[np.bool_]] | None = None,
     source: str = "container points",
@@ -54,6 +55,8 @@ def place_by_points(
     """Place `mesh` so that its clicked points fall on their pixels.
 
     Args:
+        up: the direction of the mesh that points up; None takes the one that ends up nearest to against `gravity`
+            ([3], scene's frame), "y" where that is None too. It decides nothing about the pose.
         cameras: pinhole cameras; pixels are those of their undistorted images. Give training cameras only.
         metres_per_unit: metres per unit of the mesh; None finds the scale.
         masks: where given, the placement's overlaps are measured on them; they decide nothing.
@@ -91,11 +94,15 @@ def place_by_points(
     pose[:3, 3] = stance.position - pose[:3, :3] @ centre
     errors = np.square(_errors(stance, centre, points, observed)).sum(axis=1)
     of_camera = {camera.name: errors[[other is camera for _, other, _ in observed]] for camera in used}
+    upward: Axis = up or "y"
+    if up is None and gravity is not None:
+        falling = [float(np.dot(stance.rotation @ direction(axis), gravity)) for axis in AXES]
+        upward = AXES[int(np.argmin(falling))]
     return Placement(
         pose=pose,
         scale=stance.scale,
-        up_axis=up,
-        up=stance.rotation @ direction(up),
+        up_axis=upward,
+        up=stance.rotation @ direction(upward),
         up_is_ambiguous=False,
         turn="determined",
         equivalent_turns=1,

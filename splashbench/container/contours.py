@@ -67,6 +67,8 @@ def find_contour(silhouette: NDArray) -> Contour:
     points = np.concatenate(pieces)[:, ::-1] + 0.5 if pieces else np.zeros((0, 2))
     inside = (points >= _BORDER).all(axis=1) & (points <= np.array([width, height]) - _BORDER).all(axis=1)
     points = points[inside]
+    if not len(points):  # it runs along the border alone
+        return Contour(np.zeros((0, 2)), np.zeros((0, 2)))
     points = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     # Sobel's gradient points into the silhouette.
     column, row = (points - 0.5).astype(np.float32).T

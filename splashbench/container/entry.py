@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from splashbench.container.verification import Projection, overlay
-from splashbench.errors import SplashbenchError
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.files import files_together, require_folder_place, write_model
 from splashbench.scene import Camera, Scene
 from splashbench.scene.container import ContainerMesh
@@ -79,7 +80,15 @@ def write_entry(
     Returns what stands there; other fields stay. Both are written before either takes its place.
     """
     entry = {"container_mesh": name, "container_pose": np.asarray(pose, np.float64).tolist()}
-    meta = SceneMeta.model_validate({**stated_of(scene).model_dump(), **entry, **facts})
+    try:
+        meta = SceneMeta.model_validate({**stated_of(scene).model_dump(), **entry, **facts})
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = " ".join(map(str, first["loc"]))
+        raise SplashbenchError(
+            f"{scene.directory / 'scene.json'} cannot say where the container stands ({place}: "
+            f"{one_line(first['msg'])}); check the unit of the mesh (--metres-per-unit)"
+        ) from None
     with files_together(scene.directory) as staging:
         put(staging / name)
         write_model(staging / "scene.json", meta)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from splashbench.arrays import Floats
+from splashbench.errors import SplashbenchError
 from splashbench.scene.camera import Camera
 from splashbench.scene.container import ContainerMesh
 
@@ -67,6 +68,8 @@ class CentredMesh:
     def of(cls, mesh: ContainerMesh) -> CentredMesh:
         corners = mesh.triangles
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        if not area.sum() > 0:
+            raise SplashbenchError("the container's mesh has no area: its faces are lines; export it again")
         area = area / area.sum()
         centre = area @ corners.mean(axis=1)
         # Second moments of a triangle: of its corners and of its centre, with weights 1/12 and 9/12.

@@ -7,6 +7,7 @@ unpacked.
 from __future__ import annotations
 
 import bz2
+import copy
 import io
 import math
 import warnings
@@ -14,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ MAX_ARRAYS = 1000
 # zipfile: RuntimeError for encrypted archives, NotImplementedError for compressions that it does not know.
 _DAMAGED = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
-# LZMA is not among them: its decoder allocates what a file asks for.
+# LZMA is not among them: its decoder allocates what a file asks for. bzip2 is unpacked by `_Bunzipped`.
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _LARGEST_NUMBER = 8  # bytes
@@ -102,7 +103,7 @@ def read_npz(
             for name, rank in ranks.items():
                 if (entry := _entry(entries, name)) is None:
                     raise SplashbenchError(f"{path} lacks the array {name!r}; write it again")
-                with archive.open(entry) as member:
+                with _opened(archive, entry) as member:
                     arrays[name] = _read_array(path, name, rank, member, entry.file_size)
     except FileNotFoundError:
         raise SplashbenchError(f"{path} does not exist; check the path") from None
@@ -123,6 +124,49 @@ def _require_bounded(path: Path, entries: list[zipfile.ZipInfo], limit: int) -> 
     unknown = [entry.filename for entry in entries if entry.compress_type not in _COMPRESSIONS]
     if unknown:
         raise NotImplementedError(f"{unknown[0]!r} is neither deflated nor bzipped")
+
+
+class _Bunzipped(io.RawIOBase):
+    """The content of a bzipped `entry` of an archive, from its packed bytes.
+
+    zipfile unpacks all that it has read of these at once, which for a few kilobytes may be gigabytes; bz2 does not.
+    Raises BadZipFile at the end where the checksum is another, and where there is more than the entry states.
+    """
+
+    def __init__(self, packed: IO[bytes], entry: zipfile.ZipInfo) -> None:
+        self._packed, self._stream, self._entry = packed, bz2.BZ2File(packed), entry
+        self._place, self._checksum = 0, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._place
+
+    def read(self, size: int = -1) -> bytes:
+        left = self._entry.file_size - self._place
+        content = self._stream.read(left + 1 if size < 0 else min(size, left + 1))
+        self._place += len(content)
+        self._checksum = zlib.crc32(content, self._checksum)
+        wrong = size != 0 and not content and self._checksum != self._entry.CRC
+        if wrong or self._place > self._entry.file_size:
+            raise zipfile.BadZipFile(f"{self._entry.filename!r} is damaged")
+        return content
+
+    def close(self) -> None:
+        self._stream.close()
+        self._packed.close()
+        super().close()
+
+
+def _opened(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:
+    """The content of an entry, of which no more is held at once than is asked for."""
+    if entry.compress_type != zipfile.ZIP_BZIP2:
+        return archive.open(entry)
+    packed = copy.copy(entry)
+    packed.compress_type, packed.file_size = zipfile.ZIP_STORED, entry.compress_size
+    del packed.CRC  # of what is unpacked: zipfile compares none then
+    return cast(IO[bytes], _Bunzipped(archive.open(packed), entry))
 
 
 def _entry(entries: Mapping[str, zipfile.ZipInfo], name: str) -> zipfile.ZipInfo | None:

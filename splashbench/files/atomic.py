@@ -20,11 +20,15 @@ from splashbench.files.plain import read_plain
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Of the file that marks an output: a video's has a time for each frame.
 _MAX_MARKER_BYTES = 16_000_000
-_STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-")
+# Beside an output, or within its folder, where the name ends here and a place in it follows.
+_STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-/?")
+#: As the name of an output: whatever is written into its folder.
+_WITHIN = "*"
 
 
 def _sibling(path: Path) -> Path:
-    return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{path.name}")
+    name = "" if path.name == _WITHIN else path.name
+    return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{name}")
 
 
 def is_staged_for(path: Path, output: Path) -> bool:
@@ -182,14 +186,16 @@ def _has_keys(path: Path, keys: Collection[str]) -> bool:
 
 @contextmanager
 def files_together(directory: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `directory`. Success moves its files into `directory`; failure moves none.
+    """Yield a temporary folder in `directory`, or beside it where it does not exist. Success moves its files into
+    `directory`; failure moves none.
 
     Unlike `atomic_directory` it leaves other files in `directory` where they are.
     """
     directory = Path(directory).resolve()  # "." has no name to put one beside, and a link may lead to another disk
     require_folder_place(directory)
     directory.parent.mkdir(parents=True, exist_ok=True)
-    staging = _sibling(directory)
+    # Within it where that can be: the folder above may be another disk's, or be nobody's to write into.
+    staging = _sibling(directory / _WITHIN if directory.is_dir() else directory)
     try:
         staging.mkdir()
         yield staging

@@ -63,7 +63,7 @@ def l1(image: torch.Tensor, target: NDArray[np.uint8], seen: NDArray[np.bool_]) 
 
     Raises ValueError where they differ in size.
     """
-    if image.shape != target.shape or target.shape[:2] != seen.shape:
+    if image.shape != target.shape or target.shape != (*seen.shape, 3) or seen.ndim != 2:
         raise ValueError(f"an image of {tuple(image.shape)} does not compare with {target.shape} and {seen.shape}")
     return _l1_by_torch(image, target, seen) if image.device.type != "cpu" else _L1.apply(image, target, seen)
 

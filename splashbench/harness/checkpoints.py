@@ -18,6 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from splashbench.harness.channel import GOES_ON, PAUSED
+from splashbench.submission.identity import MAX_CHECKPOINTS
 
 #: Seconds of the fit at which a state is asked for: two for each doubling, for a month. Each is a little early, so that
 #: what comes at the first offer after it counts within 10, 30, 60, 120 and 300 seconds.
@@ -58,7 +59,9 @@ class Checkpoints:
         self._left, self._tell = list(reversed(marks)), tell
 
     def offer(self, state: Callable[[], Savable], milestone: bool = False) -> None:
-        """Take what `state` makes where a mark has come, or a `milestone` was reached."""
+        """Take what `state` makes where a mark has come, or a `milestone` was reached; at most MAX_CHECKPOINTS."""
+        if len(self.seconds) >= MAX_CHECKPOINTS:
+            return
         if not milestone and (not self._left or self._elapsed() < self._left[-1]):
             return
         self._synchronise()

@@ -82,12 +82,12 @@ def state_seconds(told: list[float], seen: list[float]) -> list[float]:
 
 
 def frames_per_second(report: Report, told: float | None, frames: int) -> float | None:
-    """The frame rate that was told, where the time that all `frames` took allows it; else their mean rate."""
+    """The frame rate that was told, where the time that all `frames` took allows it; else their mean rate. None where
+    nothing was told, or no time was seen."""
     starts, ends = _one(report, TIMING_STARTS), _one(report, TIMING_ENDS)
-    if told is None or starts is None or ends is None or ends < starts:
+    # Marks that come at once are of no rendering: so many frames take longer than it takes to stamp a mark.
+    if told is None or starts is None or ends is None or ends <= starts:
         return None
-    if ends == starts:  # too short to be seen from outside
-        return told
     mean = frames / (ends - starts)
     return told if told <= _FASTER * mean else mean
 

@@ -90,6 +90,8 @@ class Run:
     _started: float = field(default_factory=time.perf_counter)
     _report: Callable[[float, str], None] | None = None
     _checkpoints: Checkpoints | None = None
+    #: seconds that saving states took so far, of the run that this is a part of
+    _saving: Callable[[], float] | None = None
 
     def progress(self, fraction: float, message: str = "") -> None:
         """Tell the user how far the fit is: `fraction` in [0, 1], and what is being done."""
@@ -130,6 +132,8 @@ class Run:
         )
 
     def _checkpoint_seconds(self) -> float:
+        if self._saving is not None:
+            return self._saving()
         return 0.0 if self._checkpoints is None else self._checkpoints.spent
 
     def note(self, name: str, text: str) -> None:

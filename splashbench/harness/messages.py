@@ -8,6 +8,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from splashbench.submission import Budget, Decision, Record, Status
 
+_NO_MEMORY = (
+    *("out of memory", "can't allocate memory", "cannot allocate memory"),
+    *("insufficient memory", "outofmemory", "unable to allocate"),
+)
+
 
 class Request(BaseModel):
     """What a child process is to do.
@@ -91,3 +96,9 @@ class Outcome(BaseModel):
             first = error.errors()[0]
             raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
         return self
+
+
+def lacks_memory(text: str) -> bool:
+    """Whether an error says that memory ran out, in the words of Python, PyTorch, CUDA, OpenCV or the system."""
+    said = text.lower()
+    return any(words in said for words in _NO_MEMORY)

@@ -22,7 +22,7 @@ from splashbench.harness.checkpoints import Checkpoints
 from splashbench.harness.contract import Fitted, Method, Run
 from splashbench.harness.discovery import load_method
 from splashbench.harness.external.importers import Importer, load_importer
-from splashbench.harness.messages import Failure, Outcome, Request
+from splashbench.harness.messages import Failure, Outcome, Request, lacks_memory
 from splashbench.harness.output_checks import check_geometry, check_particles, checked_render
 from splashbench.scene import Camera, Scene, TrainingScene
 from splashbench.scene.particles import most_particles
@@ -50,7 +50,7 @@ def carry_out(request_path: str, channel: Channel | None = None) -> int:
         outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=f"out of memory {error}".strip())
     except Exception as error:
         raise_if_disk_full(getattr(error, "filename", None) or request.model, error)
-        if "out of memory" in str(error).lower():
+        if lacks_memory(str(error)):
             outcome = Outcome(status=Status.OUT_OF_MEMORY, reason=_one_line(error))
         else:
             import traceback

@@ -50,6 +50,7 @@ def write_oracle(
             preset="truth",
             scene=scene.name,
             scene_digest=scene.digest,
+            told=scene.stated,
             control=True,
             splashbench_version=__version__,
             hardware=hardware.describe(),

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from splashbench.child import child_command, raise_if_disk_was_full
 from splashbench.errors import one_line
-from splashbench.files import tree_bytes, write_model
+from splashbench.files import remove_any, tree_bytes, write_model
 from splashbench.harness import keeper
 from splashbench.harness.clock import FitTime, Report, fit_time, frames_per_second, state_seconds
 from splashbench.harness.messages import Failure, Outcome, Request
@@ -22,7 +22,7 @@ from splashbench.harness.outputs import require_liquid, require_views, tree_dige
 from splashbench.harness.watched_process import Watched, watch
 from splashbench.scene import Particles, Scene, TrainingScene
 from splashbench.submission import Checkpoint, Record, Status
-from splashbench.submission.identity import MAX_NOTES
+from splashbench.submission.identity import MAX_CHECKPOINTS, MAX_NOTES
 from splashbench.submission.submission import unusable_files
 
 
@@ -45,6 +45,9 @@ def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
         return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
     storage = tree_bytes(model)
     time = _fit_time(watched, storage)
+    if time is not None and len(time.states) > _states_saved(request):
+        # Pauses that nobody asked for, or in which nothing was saved, are the fit's own time.
+        time = FitTime(time.seconds + time.paused, [], 0.0)
     if time is None:
         reason = "the fit's process ended before the harness's own code in it had come to its end"
         return _failed(record, Outcome(status=Status.CRASHED, reason=reason), watched)
@@ -64,7 +67,7 @@ def run_phases(scratch: Path, staging: Path, request: Request) -> Record:
             "dynamic_bytes": storage - tree_bytes(model / "static"),
         }
     )
-    states = state_seconds(outcome.checkpoints, time.states) if request.checkpoints else []
+    states = state_seconds(outcome.checkpoints, time.states)[:MAX_CHECKPOINTS] if request.checkpoints else []
     # What the fit left in its scratch folder is no part of the model, whose bytes are counted.
     _empty(Path(request.scratch))
     saved = tree_digest(model)
@@ -119,6 +122,11 @@ def _fit_time(watched: Watched, storage_bytes: int) -> FitTime | None:
     return None if watched.report is None else fit_time(Report.model_validate(watched.report), storage_bytes)
 
 
+def _states_saved(request: Request) -> int:
+    """How many states of the fit were saved on its way."""
+    return 0 if request.checkpoints is None else sum(path.is_dir() for path in Path(request.checkpoints).iterdir())
+
+
 def _checkpoint(
     scratch: Path, staging: Path, request: Request, training: TrainingScene, number: int, seconds: float
 ) -> Checkpoint:
@@ -158,7 +166,8 @@ def run_phase(scratch: Path, request: Request, label: str, training: TrainingSce
     training: the scene of `request`, read before a method could change it.
     """
     path, progress = scratch / "request.json", Path(request.progress)
-    progress.unlink(missing_ok=True)
+    for left in (progress, scratch / "log"):  # an earlier phase may have put anything there
+        remove_any(left)
     write_model(path, request)
     views = [(camera, t) for camera, t, _ in requested_views(request, training)]
     watched = watch(

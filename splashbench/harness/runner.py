@@ -16,7 +16,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import atomic_directory, remove_any, write_model
 from splashbench.harness import estimates, hardware
 from splashbench.harness.contract import Method
-from splashbench.harness.devices import chosen_device
+from splashbench.harness.devices import AUTO, CPU, chosen_device
 from splashbench.harness.discovery import EXTERNAL, ORACLE, load_method
 from splashbench.harness.leftovers import clear_leftovers, held, require_alone, scratch_folder
 from splashbench.harness.messages import Request
@@ -94,8 +94,12 @@ def run_method(
             "`external` is run by commands: splashbench run-external SCENE OUT --name ... --command ..."
         )
     if name == ORACLE:
-        if preset or overrides or withheld or checkpoints or budget:
-            raise SplashbenchError("the oracle is the truth itself: it has no presets, settings or fit; leave them out")
+        fit = preset or overrides or withheld or checkpoints or budget or timeout_seconds or seed
+        if fit or exr or not keep_model or device not in (CPU, AUTO):
+            raise SplashbenchError(
+                "the oracle is the truth itself: it has no presets, settings, seeds, device, model or fit, and no EXR; "
+                "leave them out"
+            )
         from splashbench.harness.oracle import write_oracle
 
         return write_oracle(scene, out, geometry=oracle_geometry, replace=replace)
@@ -114,6 +118,7 @@ def run_method(
         device=device,
         scene=scene.name,
         scene_digest=scene.digest,
+        told=scene.stated,
         withheld=withheld,
     )
     kept = kept_timesteps(scene.n_frames, withheld)

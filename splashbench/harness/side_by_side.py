@@ -116,7 +116,9 @@ def ahead(
 
 def _within(run: Run, function: Callable[[Run], Any], report: Callable[[float, str], None]) -> Any:
     """What `function` returns for a part of `run` that is made now, in its stages and notes."""
-    part = replace(run, _overhead_seconds=0.0, _inner_seconds=0.0, _report=report, _checkpoints=None)
+    # It offers no states of its own, but what `run` offers meanwhile is in none of its stages.
+    saving = run._checkpoint_seconds
+    part = replace(run, _overhead_seconds=0.0, _inner_seconds=0.0, _report=report, _checkpoints=None, _saving=saving)
     try:
         return function(part)
     finally:

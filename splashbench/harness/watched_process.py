@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splashbench.errors import SplashbenchError
+from splashbench.files import open_plain
 from splashbench.processes import RUN_MARK, ends_within, has_ended, marked_processes, resident_bytes
 from splashbench.progress import Bar
 
@@ -25,6 +27,8 @@ _POLL_SECONDS = 0.05
 _LOG_TAIL_LINES = 20
 _LOG_TAIL_BYTES = 20_000
 _SILENT_SECONDS = 1.0
+# A log may be of any size; of progress so much is read at a time.
+_ANY_SIZE, _MOST_READ = 1 << 62, 1 << 20
 # For a keeper to end what its process left, before it is killed itself.
 _KEEPER_SECONDS = 8.0
 
@@ -108,11 +112,15 @@ def watch(
         for fraction, message in reader.new():
             bar.update(fraction, message)
     finally:
-        # Also when the user interrupts: a method may have started processes of its own.
-        if kept:
-            _ask_to_end(process)
-        _kill_group(process)
-        strays = _kill_marked(mark, process.pid)
+        # Also when the user interrupts, and again while this lasts: a method may have started processes of its own.
+        try:
+            if kept:
+                _ask_to_end(process)
+        finally:
+            try:
+                _kill_group(process)
+            finally:
+                strays = _kill_marked(mark, process.pid)
         bar.close()
         told = report.close()
     strays += told["strays"] if told else []
@@ -181,11 +189,12 @@ class ProgressReader:
         self._path, self._position = path, 0
 
     def new(self) -> list[tuple[float, str]]:
-        if not self._path.is_file():
+        try:
+            with open_plain(self._path, _ANY_SIZE) as (stream, _):
+                stream.seek(self._position)
+                data = stream.read(_MOST_READ)
+        except (OSError, SplashbenchError):  # not there yet; or the process has put something else there
             return []
-        with self._path.open("rb") as stream:
-            stream.seek(self._position)
-            data = stream.read()
         end = data.rfind(b"\n") + 1
         self._position += end
         lines = []
@@ -200,9 +209,9 @@ class ProgressReader:
 
 def _tail(log: Path) -> list[str]:
     try:
-        with log.open("rb") as stream:
-            stream.seek(max(0, log.stat().st_size - _LOG_TAIL_BYTES))
-            text = stream.read().decode("utf-8", "replace")
-    except FileNotFoundError:  # the process has removed it
+        with open_plain(log, _ANY_SIZE) as (stream, size):
+            stream.seek(max(0, size - _LOG_TAIL_BYTES))
+            text = stream.read(_LOG_TAIL_BYTES).decode("utf-8", "replace")
+    except (OSError, SplashbenchError):  # the process has removed it, or put something else there
         return []
     return [line.rstrip()[:300] for line in text.splitlines() if line.strip()][-_LOG_TAIL_LINES:]

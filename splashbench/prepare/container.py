@@ -50,9 +50,15 @@ def container_masks(folder: Path | None, undistorters: Mapping[str, Undistorter]
 
 def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
     """Raise SplashbenchError for a container mask of another size than the recording's (width, height), for clicks
-    outside the frames, and where no training camera has a mask and there are no clicks."""
+    outside the frames, and where a mesh has no clicks and fewer than two training cameras have masks to place it by."""
     table, folder = session.container, session.container_folder
-    assert table is not None
+    masked = []
+    for camera in session.cameras if folder is not None else ():
+        path = Path(folder or "") / f"{camera}.png"
+        if path.is_file() and read_raw_mask(path, *sizes[camera]).any():
+            masked.append(camera)
+    if table is None:
+        return
     for number, click in enumerate(table.points, 1):
         for camera, (u, v) in click.pixels.items():
             width, height = sizes[camera]
@@ -61,15 +67,11 @@ def check_masks(session: Session, sizes: Mapping[str, tuple[int, int]]) -> None:
                     f"{session.directory / DESCRIPTION}: [container] point {number} lies at ({u:g}, {v:g}) in camera"
                     f" {camera}, whose frames are {width}x{height}; give pixels of the raw frame"
                 )
-    masked = []
-    for camera in session.cameras if folder is not None else ():
-        path = Path(folder or "") / f"{camera}.png"
-        if path.is_file():
-            read_raw_mask(path, *sizes[camera])
-            masked.append(camera)
-    if not table.points and not any(camera in session.train for camera in masked):
+    training = sum(camera in session.train for camera in masked)
+    if not table.points and training < 2:
         raise SplashbenchError(
-            f"{folder}: no mask of a training camera, named <camera>.png; give some, or points under [container]"
+            f"{folder}: {training} training camera{' has' if training == 1 else 's have'} a container mask "
+            "(<camera>.png) that is not empty, two are needed; draw more, or give points under [container]"
         )
 
 
@@ -129,17 +131,23 @@ def _place(
     training = [camera for camera in cameras if camera.name in session.train]
     training_masks = {camera.name: masks[camera.name] for camera in training if camera.name in masks}
     placement: Placement | None = None
+    if table.up is None and gravity is None and len(training_masks) < 2:
+        raise SplashbenchError(
+            f"{session.directory / DESCRIPTION}: neither a board nor a marker says what is up, and clicked points do "
+            "not tell which side of the container's mesh is; give up under [container]"
+        )
     if table.points:
         placement = place_by_points(
             mesh,
             training,
             [ClickedPoint(click.point, _pinhole_pixels(click.pixels, undistorters)) for click in table.points],
-            up=table.up or "y",
+            up=table.up,
+            gravity=gravity,
             metres_per_unit=metres_per_unit,
             masks=training_masks,
             source=f"{session.directory / DESCRIPTION}: [container] points",
         )
-    if training_masks:
+    if len(training_masks) >= 2:
         placement = place_by_silhouettes(
             mesh,
             training,
@@ -150,7 +158,7 @@ def _place(
             initial=None if placement is None else placement.pose,
             source=str(session.container_folder),
         )
-    assert placement is not None  # `check_masks` found points or masks
+    assert placement is not None  # `check_masks` found points, or masks of two cameras
     return placement
 
 

@@ -106,6 +106,12 @@ def intrinsics_gates(calibrations: Mapping[str, Calibration]) -> list[Gate]:
     ]
 
 
+def shown_widths(widths: Iterable[int]) -> str:
+    """The widths of a rig's images, such as "3840" or "1920 to 3840"."""
+    among = sorted(set(widths))
+    return str(among[0]) if len(among) == 1 else f"{among[0]} to {among[-1]}"
+
+
 def stillness_limit(width: int) -> float:
     """Shift of a camera's picture to accept, in pixels of an image `width` wide: 1 px per 2000, never below half one.
 
@@ -114,8 +120,11 @@ def stillness_limit(width: int) -> float:
     return max(0.5, width / 2000)
 
 
-def stillness_gates(stillness: Mapping[str, Stillness], width: int) -> list[Gate]:
-    """Whether the pour shows the place that the static clip shows, and whether every camera stayed where it was."""
+def stillness_gates(stillness: Mapping[str, Stillness], widths: Mapping[str, int]) -> list[Gate]:
+    """Whether the pour shows the place that the static clip shows, and whether every camera stayed where it was.
+
+    widths: of the cameras' images, in pixels.
+    """
     # By the clearest instant: a hand may hide the background at another.
     least = {camera: max(shift.agreeing for shift in seen.values()) for camera, seen in stillness.items()}
     fewest = min(least, key=least.__getitem__)
@@ -148,9 +157,9 @@ def stillness_gates(stillness: Mapping[str, Stillness], width: int) -> list[Gate
         if any(shift.px is not None for shift in seen.values())
     }
     if worst_px:
-        limit = stillness_limit(width)
-        worst = max(worst_px, key=worst_px.__getitem__)
-        moved = [camera for camera, px in worst_px.items() if px > limit]
+        limits = {camera: stillness_limit(widths[camera]) for camera in worst_px}
+        worst = max(worst_px, key=lambda camera: worst_px[camera] / limits[camera])
+        moved = [camera for camera, px in worst_px.items() if px > limits[camera]]
         course = ", ".join(
             f"{instant} {'unknown' if shift.px is None else f'{shift.px:.2f}'}"
             for instant, shift in stillness[worst].items()
@@ -159,11 +168,11 @@ def stillness_gates(stillness: Mapping[str, Stillness], width: int) -> list[Gate
             Gate(
                 "camera_shift",
                 worst_px[worst],
-                limit,
+                limits[worst],
                 "at most",
                 f"px that the background moved from the static clip to the pour, camera {worst}: {course}",
                 True,
-                " ".join(_moved(camera, stillness[camera], limit) for camera in moved or [worst]),
+                " ".join(_moved(camera, stillness[camera], limits[camera]) for camera in moved or [worst]),
             )
         )
     return gates
@@ -237,12 +246,15 @@ def sync_gates(clocks: Mapping[str, ClockFit], sequence: SequenceSync | None) ->
     return gates
 
 
-def pose_gates(poses: Poses, cameras: Iterable[str], width: int) -> list[Gate]:
-    """All fixed cameras posed, the reprojection error, and how much of the sweep helped."""
-    names = list(cameras)
+def pose_gates(poses: Poses, widths: Mapping[str, int]) -> list[Gate]:
+    """All fixed cameras posed, the reprojection error, and how much of the sweep helped.
+
+    widths: of the images of all fixed cameras, in pixels.
+    """
+    names = list(widths)
     missing = [camera for camera in names if camera not in poses.w2c]
-    error, limit = poses.mean_error_px, pixel_limit(width)
-    detail = f"px, mean over {poses.n_observations} observations in frames {width} px wide"
+    error, limit = poses.mean_error_px, float(np.mean([pixel_limit(width) for width in widths.values()]))
+    detail = f"px, mean over {poses.n_observations} observations in frames {shown_widths(widths.values())} px wide"
     by_board = poses.metres_per_unit is not None
     again = "film the static scene and the sweep again in one go, with nothing in view that moves"
     more, past = SWEEP_AGAIN, "past"
@@ -341,8 +353,11 @@ def mask_gates(health: Mapping[str, MaskHealth], n_frames: int) -> list[Gate]:
     ]
 
 
-def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -> list[Gate]:
-    """How well the placed mesh covers its masks, of the cameras that placed it and of those that did not."""
+def container_gates(placed: PlacedContainer, train: Iterable[str], widths: Mapping[str, int]) -> list[Gate]:
+    """How well the placed mesh covers its masks, of the cameras that placed it and of those that did not.
+
+    widths: of the cameras' images, in pixels.
+    """
     seen, placement = placed.projections, placed.placement
     fitted = [camera for camera in train if camera in seen]
     held_out = [camera for camera in seen if camera not in fitted]
@@ -356,10 +371,10 @@ def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -
         gates.append(Gate("container_is_the_container", overlap, 0.8, "at least", detail_of_limit, True, remedy))
         medians_px = {camera: seen[camera].contour_median_px for camera in fitted}
         medians = {camera: np.inf if median is None else median for camera, median in medians_px.items()}
-        worst = max(fitted, key=medians.__getitem__)
+        limits = {camera: max(1.5, widths[camera] / 1000) for camera in fitted}
+        worst = max(fitted, key=lambda camera: medians[camera] / limits[camera])
         detail = f"px between projected and masked outline, median, camera {worst}"
-        limit = max(1.5, width / 1000)
-        gates.append(Gate("container_outline", medians[worst], limit, "at most", detail, False, remedy))
+        gates.append(Gate("container_outline", medians[worst], limits[worst], "at most", detail, False, remedy))
     if held_out:
         worst = min(held_out, key=lambda camera: seen[camera].iou)
         detail = f"projected mesh and mask, held-out camera {worst}"
@@ -370,8 +385,8 @@ def container_gates(placed: PlacedContainer, train: Iterable[str], width: int) -
         gates.append(Gate("container_sigma", placement.position_sigma, 2e-3, "at most", detail, False, remedy))
     clicked = {name: error for name, error in (placement.point_rms_px or {}).items() if np.isfinite(error)}
     if clicked:
-        worst = max(clicked, key=clicked.__getitem__)
-        detail = f"px RMS between clicked and projected points, camera {worst}"
+        worst = max(clicked, key=lambda camera: clicked[camera] / widths[camera])
+        detail, width = f"px RMS between clicked and projected points, camera {worst}", widths[worst]
         remedy = "check the points under [container]"
         gates.append(Gate("container_clicks", clicked[worst], max(5.0, width / 400), "at most", detail, False, remedy))
         if not fitted:  # nothing else tells whether the clicks make sense

@@ -9,6 +9,7 @@ was interrupted.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_directory, is_staged_for, write_json, write_text
+from splashbench.files import (
+    atomic_directory,
+    atomic_path,
+    is_plain_file,
+    is_staged_for,
+    read_plain,
+    write_json,
+    write_text,
+)
 from splashbench.prepare import container as containers
 from splashbench.prepare import gates as g
 from splashbench.prepare.audio import clocks as audio
@@ -43,6 +52,7 @@ from splashbench.scene.container import ContainerMesh, read_mesh
 
 WORK_FOLDER = "prepare"  # within the session
 _UNFINISHED = "unfinished_scene.txt"
+_MAX_NOTE_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -83,7 +93,8 @@ def prepare(session_directory: Path, scene_directory: Path, options: PrepareOpti
             scene_directory, replace=options.replace, holds="train_meta.json", inputs=[session_directory, work]
         ) as staging,
     ):
-        (work / _UNFINISHED).write_text(str(staging), encoding="utf-8")
+        with atomic_path(work / _UNFINISHED) as note:
+            note.write_bytes(os.fsencode(staging))  # a folder's name need not be UTF-8
         preparation = _run_stages(session, options, store, staging)
         write_json(staging / "prepare_report.json", preparation.as_json())
         write_text(staging / "prepare_report.html", html_report(preparation))
@@ -97,8 +108,8 @@ def _unfinished_removed(work: Path, scene_directory: Path) -> Iterator[None]:
     Only beside the scene that is asked for now: a note in a stranger's session must not delete anything else.
     """
     note = work / _UNFINISHED
-    if note.is_file():
-        unfinished = Path(note.read_bytes()[:4096].decode("utf-8", "replace"))
+    if is_plain_file(note):
+        unfinished = Path(os.fsdecode(read_plain(note, _MAX_NOTE_BYTES)))
         if is_staged_for(unfinished, scene_directory):
             shutil.rmtree(unfinished, ignore_errors=True)
     yield
@@ -117,17 +128,19 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
     clocks = synced.clocks
     interval = video.motion_interval(store, session, pour, clocks, options.interval)
     sequence = audio.sequence_sync(store, pour, clocks, interval.interval, session.reference)
+    pour.forget_sound()
     sampled = video.sampled_frames(store, pour, clocks, interval, timesteps, "sampling_by_arrival")
 
     calibrations = calibration.calibrations(store, rig)
     lenses = {camera: result.lens for camera, result in calibrations.items()}
+    widths = {camera: lenses[camera].width for camera in names}
     rig.check_sizes(lenses, pour.recordings)
     undistorters = {camera: Undistorter(lens) for camera, lens in lenses.items()}
     still = poses.stillness(store, rig, pour, clocks, interval.interval)
     gates = [
         *g.intrinsics_gates(calibrations),
         *g.sync_gates(clocks, sequence),
-        *g.stillness_gates(still, lenses[names[0]].width),
+        *g.stillness_gates(still, widths),
     ]
     # The poses cost minutes and may fail for a reason that these gates know.
     with told_with(gates):
@@ -147,7 +160,7 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
         clocks = sync.shifted(clocks, paths.shift_s)
         sampled = video.sampled_frames(store, pour, clocks, interval, timesteps, "sampling")
     gates += [
-        *g.pose_gates(scene_poses, names, lenses[names[0]].width),
+        *g.pose_gates(scene_poses, widths),
         *g.metric_gates(frame),
         *g.sampling_gates(sampled),
     ]
@@ -155,7 +168,7 @@ def _run_stages(session: Session, options: PrepareOptions, store: StageStore, di
 
     container = containers.container_stage(store, session, mesh, cameras, container_masks, undistorters)
     if container is not None:
-        gates += g.container_gates(container, session.train, lenses[names[0]].width)
+        gates += g.container_gates(container, session.train, widths)
         require(gates, str(session.container_mesh))
     record, mask_store = masks.masks_of_frames(
         store, session, pour, options.masks, sampled, undistorters, clocks, interval.start
@@ -213,11 +226,8 @@ def _check_what_later_stages_need(
     """Report at once what can be seen at once, not after the hours of the stages before."""
     headers = {camera: recording.headers for camera, recording in pour.recordings.items()}
     for recording in rig.videos():
-        _ = recording.headers
-    if mesh is not None:
-        containers.check_masks(
-            session, {camera: (first.width, first.height) for camera, (first, *_) in headers.items()}
-        )
+        recording.require_one_size()
+    containers.check_masks(session, {camera: (first.width, first.height) for camera, (first, *_) in headers.items()})
     if options.masks is None and session.masks.provider == "sam3":
         sam3_provider(session, pour.recordings)
 

@@ -9,6 +9,7 @@ folder of them stands for a chapter.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -160,7 +161,7 @@ class Session(SessionTable):
         root = self._directory.resolve()
         if "\0" in relative:
             raise SplashbenchError(f"{self._directory / DESCRIPTION}: {what} has an unusable name; rename the file")
-        path = (root / relative).resolve()
+        path = Path(os.path.realpath(root / relative))  # Path.resolve raises for links that lead in a circle
         if not path.is_relative_to(root):
             raise SplashbenchError(
                 f"{self._directory / DESCRIPTION}: {relative} ({what}) lies outside the session; "

@@ -11,7 +11,9 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import os
 import shutil
+import stat
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -25,7 +27,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from splashbench.arrays import plain
 from splashbench.errors import SplashbenchError
-from splashbench.files import atomic_path
+from splashbench.files import atomic_path, is_plain_file, read_plain
 from splashbench.version import __version__
 
 Stage = Literal["sync", "motion", "intrinsics", "poses", "metric", "container", "masks", "scene"]
@@ -33,9 +35,12 @@ FileFacts = tuple[str, int, int]  # name, bytes, nanoseconds of modification
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
 # Results depend on these as much as on the recordings.
-_LIBRARIES = ("av", "numpy", "opencv-contrib-python-headless", "pycolmap", "scipy")
+_LIBRARIES = ("av", "numpy", "opencv-contrib-python-headless", "pillow", "pycolmap", "scipy", "trimesh")
 _MARK = "This folder holds what `splashbench prepare` found out about the session beside it. It may be deleted.\n"
 _MARK_NAME, _LOCK_NAME, _SCRATCH_NAME = "README.txt", ".lock", "scratch"
+
+# Rooms of the package whose code makes results: see `_code_digest`.
+_ROOMS = ("prepare", "container", "observe", "background", "scene", "native", "files", "pages")
 
 T = TypeVar("T")
 
@@ -142,13 +147,15 @@ class StageStore:
 def _code_digest() -> str:
     """SHA-256 of the source that makes results: a version alone does not tell an edited checkout from what it was.
 
-    That is `prepare`, the container's room, and the modules that all rooms share.
+    That is `prepare`, the rooms that it imports, those that these import, and the modules that all rooms share.
     """
     package = Path(__file__).parents[1]
-    files = [*package.glob("*.py"), *(package / "prepare").rglob("*.py"), *(package / "container").rglob("*.py")]
+    files = [*package.glob("*.py")]
+    for room in _ROOMS:
+        files += [path for kind in ("*.py", "*.cpp", "*.h") for path in (package / room).rglob(kind)]
     digest = hashlib.sha256()
     for path in sorted(files):
-        digest.update(path.name.encode() + path.read_bytes())
+        digest.update(f"{path.relative_to(package).as_posix()}\0".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -165,6 +172,7 @@ def open_stages(folder: Path, again_from: Stage | None = None) -> Iterator[Stage
         # Whatever else is called README.txt: results are deleted here without asking.
         if folder.is_dir() and any(folder.iterdir()) and not _is_ours(folder):
             raise SplashbenchError(f"{folder} holds something else; name another folder with --work")
+        _require_own_files(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _MARK_NAME).write_text(_MARK, encoding="utf-8")
         lock = FileLock(folder / _LOCK_NAME).acquire(blocking=False)
@@ -183,9 +191,23 @@ def open_stages(folder: Path, again_from: Stage | None = None) -> Iterator[Stage
         yield store
 
 
+def _require_own_files(folder: Path) -> None:
+    """Raise SplashbenchError for a link or anything but files and folders among stored results: who made the session
+    might have put it there, and it would be written through, deleted beyond, or read without end."""
+    for root, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            mode = Path(root, name).lstat().st_mode
+            if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
+                raise SplashbenchError(
+                    f"{Path(root, name)} is a link, pipe or device, which no stored result is; remove it, or name "
+                    "another place with --work"
+                )
+        folders[:] = [name for name in folders if Path(root, name) != folder / _SCRATCH_NAME]  # emptied, never read
+
+
 def _is_ours(folder: Path) -> bool:
     mark = folder / _MARK_NAME
-    return mark.is_file() and mark.stat().st_size == len(_MARK.encode()) and mark.read_bytes() == _MARK.encode()
+    return is_plain_file(mark) and mark.stat().st_size == len(_MARK.encode()) and mark.read_bytes() == _MARK.encode()
 
 
 def _sizes(folder: Path | None) -> dict[str, int]:
@@ -233,9 +255,9 @@ def _read(path: Path, key: str, adapter: TypeAdapter[Any], folder: Path | None) 
     """(seconds, result) from a stored result with this key; None where there is none that can be read, or where the
     files in its `folder` are not those that it had."""
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(read_plain(path))
         if stored["key"] != key or stored["files"] != _sizes(folder):
             return None
         return float(stored["seconds"]), adapter.validate_python(stored["result"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
+    except (OSError, SplashbenchError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
         return None

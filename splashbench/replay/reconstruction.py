@@ -5,13 +5,15 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.errors import SplashbenchError
+from splashbench.errors import SplashbenchError, one_line
 from splashbench.harness.contract import Fitted, Render
 from splashbench.harness.discovery import load_method, registered
 from splashbench.harness.training_copy import make_training_copy
@@ -20,6 +22,8 @@ from splashbench.scene import Camera, Gaussians, Particles, Scene, SignedDistanc
 from splashbench.submission import Status, Submission
 from splashbench.submission.cameras import CAMERAS, read_cameras
 from splashbench.submission.withheld import kept_timesteps
+
+Answer = TypeVar("Answer")
 
 _NO_MODEL = "keeps no model; run the method again, without --no-model"
 
@@ -75,7 +79,30 @@ class Reconstruction:
         and between timesteps, where there is no model.
         """
         self._require_recorded(time)
-        return self.fitted.render(self.camera(camera) if isinstance(camera, str) else camera, float(time))
+        seen_by = self.camera(camera) if isinstance(camera, str) else camera
+
+        def rendered() -> Render:
+            view = self.fitted.render(seen_by, float(time))
+            size, shapes = (seen_by.height, seen_by.width), (np.shape(view.rgb), np.shape(view.alpha))
+            if shapes != ((*size, 3), size):
+                raise ValueError(f"pictures of shape {shapes[0]} and {shapes[1]} for a camera of {size}")
+            if not (np.isfinite(view.rgb).all() and np.isfinite(view.alpha).all()):
+                raise ValueError("pictures with values that are not finite")
+            return view
+
+        return self._asked(f"the view of camera {seen_by.name} at {time:.4g} s", rendered)
+
+    def _asked(self, what: str, answer: Callable[[], Answer]) -> Answer:
+        """`answer`, which asks the method for `what`. Raises SplashbenchError where the method fails."""
+        try:
+            return answer()
+        except (SplashbenchError, MemoryError):
+            raise
+        except Exception as error:  # a stranger's code, or a model that nobody foresaw
+            raise SplashbenchError(
+                f"method {self.submission.identity.method} cannot give {what} of {self.submission.directory} "
+                f"({one_line(f'{type(error).__name__}: {error}')}); test the method, or run it again"
+            ) from error
 
     def _require_recorded(self, time: float) -> None:
         """Raise SplashbenchError for a time that is not of the recording; cameras' own times may lie a step beyond."""
@@ -86,16 +113,19 @@ class Reconstruction:
 
     def empty_view(self, camera: Camera | str) -> NDArray[np.float32] | None:
         """What the view would be without liquid, float32 [H, W, 3], sRGB in [0, 1]; None where that is not known."""
-        return self.fitted.empty_view(self.camera(camera) if isinstance(camera, str) else camera)
+        seen_by = self.camera(camera) if isinstance(camera, str) else camera
+        return self._asked("the view without liquid", lambda: self.fitted.empty_view(seen_by))
 
     def gaussians(self, time: float, eye: NDArray | None = None) -> Gaussians | None:
         """The liquid's Gaussians at `time`, coloured as seen from `eye` [3] (scene units; the cameras' mean place)."""
         self._require_recorded(time)
-        return self.fitted.gaussians(float(time), self.eye if eye is None else np.asarray(eye, dtype=np.float64))
+        seen_from = self.eye if eye is None else np.asarray(eye, dtype=np.float64)
+        return self._asked(f"Gaussians at {time:.4g} s", lambda: self.fitted.gaussians(float(time), seen_from))
 
     def static_gaussians(self, eye: NDArray | None = None) -> Gaussians | None:
         """The background's Gaussians, as `gaussians`; None where the method keeps no background apart."""
-        return self.fitted.static_gaussians(self.eye if eye is None else np.asarray(eye, dtype=np.float64))
+        seen_from = self.eye if eye is None else np.asarray(eye, dtype=np.float64)
+        return self._asked("the background's Gaussians", lambda: self.fitted.static_gaussians(seen_from))
 
     @cached_property
     def eye(self) -> NDArray[np.float64]:
@@ -104,7 +134,9 @@ class Reconstruction:
 
     @cached_property
     def _particles(self) -> Particles | None:
-        return self.submission.particles()
+        stored = self.submission.particles()
+        # A run that withholds timesteps hands in none, while its model has those of the timesteps that it saw.
+        return self._asked("particles", self.fitted.particles) if stored is None else stored
 
     def particles(self) -> Particles | None:
         """The method's particles on the timesteps, or None. Raises SplashbenchError for those of other timesteps."""
@@ -131,7 +163,7 @@ class Reconstruction:
         Between timesteps it is the method's own, else the mean of the two around, weighted by nearness.
         """
         self._require_recorded(time)
-        made = self.fitted.surface(float(time))
+        made = self._asked(f"the surface at {time:.4g} s", lambda: self.fitted.surface(float(time)))
         if made is not None:
             return made
         distances = self._distances
@@ -154,7 +186,7 @@ class Reconstruction:
     def velocity(self, time: float) -> VelocityField | None:
         """The liquid's velocity at `time` on a grid, or None for a method without one."""
         self._require_recorded(time)
-        return self.fitted.velocity(float(time))
+        return self._asked(f"the velocity at {time:.4g} s", lambda: self.fitted.velocity(float(time)))
 
 
 def load(

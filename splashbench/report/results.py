@@ -143,12 +143,12 @@ def _one_each(sources: Iterable[ResultFile], left_out: list[LeftOut]) -> list[Re
 
 
 def _without_repeats(sources: list[ResultFile], left_out: list[LeftOut]) -> list[ResultFile]:
-    """`sources` without those of one method, settings, scene and seed: an old and a new run."""
+    """`sources` without those of one method, settings, scene, seed and hints: an old and a new run."""
     by_run: dict[tuple[str, ...], list[ResultFile]] = {}
     for source in sources:
         result = source.result
         same = (result.digests.scene, result.protocol_label, result.method, result.preset)
-        key = (*same, str(result.seed), result.settings_digest, result.hardware_label)
+        key = (*same, str(result.seed), result.settings_digest, result.hardware_label, str(result.told))
         by_run.setdefault(key, []).append(source)
     repeated = set()
     for runs in by_run.values():
@@ -156,8 +156,8 @@ def _without_repeats(sources: list[ResultFile], left_out: list[LeftOut]) -> list
             twin = runs[0 if n else 1]
             repeated.add(source.path)
             reason = (
-                f"and {twin.path} are two runs of {source.result.method} with one seed and the same settings; "
-                "remove the older one, or raise the method's version"
+                f"and {twin.path} are two runs of {source.result.method} with one seed and the same settings, "
+                "told the same; remove the older one, or raise the method's version"
             )
             left_out.append(LeftOut(source.path, reason))
     return [source for source in sources if source.path not in repeated]

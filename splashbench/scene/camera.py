@@ -48,6 +48,11 @@ class Camera:
         rotation = self.w2c[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise ValueError(f"camera {self.name}: w2c does not hold a rotation")
+        # What is rounding is taken out: renderers and files ask for a pinhole to the last bit.
+        self.K[1:, 0], self.K[2] = 0, (0, 0, 1)
+        if abs(self.K[0, 1]) <= _ROUNDING * self.K[0, 0]:
+            self.K[0, 1] = 0
+        self.w2c[3] = 0, 0, 0, 1
         self.K.setflags(write=False)
         self.w2c.setflags(write=False)
 

@@ -117,7 +117,9 @@ def mesh_path(directory: Path, name: str) -> Path:
 
 def copy_mesh(source: Path, target: Path, name: str) -> None:
     """Copy the file that scene.json in `source` names as `container_mesh` to its place in the scene `target`."""
-    content = read_plain(mesh_path(source, name))
+    from splashbench.scene import mesh_process
+
+    content = read_plain(mesh_path(source, name), mesh_process.MAX_FILE_BYTES)
     path = Path(target, name)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,8 @@ from splashbench.files import MAX_PIXELS, read_json, validate_model
 _IMAGE_PATH = re.compile(r"[A-Za-z0-9_][\w-]*/[A-Za-z0-9_][\w.-]*\.(?:jpg|jpeg|png|JPG|PNG)")
 # Cameras are fixed. A difference beyond rounding is a moving camera, which is not supported.
 _STATIC_TOLERANCE = 1e-6
+# Of what a pose's last row may be off from 0 0 0 1.
+_POSE_ROUNDING = 1e-6
 # Pixels, scene units or seconds: nothing real comes near, and sums and squares stay finite.
 LARGEST = 1e9
 
@@ -70,7 +73,7 @@ class SplitFile:
                 self.paths[self.names[c]].append(name)
         for names in self.paths.values():
             if len(set(names)) != n_frames:
-                twice = next(name for name in names if names.count(name) > 1)
+                twice = Counter(names).most_common(1)[0][0]
                 raise SplashbenchError(f"{path}: fn names {twice} in two frames; fix the entry")
         self.K, self.w2c, self.size, self.n_frames = intrinsics, w2c, (meta.w, meta.h), n_frames
 
@@ -132,6 +135,8 @@ class SceneMeta(BaseModel):
                 raise ValueError("container_pose must be 4x4")
             if not np.isfinite(self.container_pose).all():
                 raise ValueError("container_pose must be finite")
+            if np.abs(np.array(self.container_pose[3]) - [0, 0, 0, 1]).max() > _POSE_ROUNDING:
+                raise ValueError("container_pose must end in 0 0 0 1; it may be transposed")
         for camera, (width, height) in (self.sizes or {}).items():
             if not (0 < width <= 65536 and 0 < height <= 65536 and width * height <= MAX_PIXELS):
                 raise ValueError(f"sizes: camera {camera} has {width}x{height} pixels")

@@ -226,10 +226,10 @@ class NeuroFluidSource(SceneSource):
         return None
 
     def _other_times(self, true: Particles) -> list[str]:
-        assert self.meta.times is not None
-        if true.velocities is None:
+        times = self.meta.times  # null where scene.json says so
+        if times is None or len(times) < 2 or true.velocities is None or not true.count:
             return []
-        steps = np.diff(self.meta.times)
+        steps = np.diff(times)
         moved = np.diff(true.positions.astype(np.float64), axis=0)
         expected = (true.velocities[1:] + true.velocities[:-1]).astype(np.float64) / 2 * steps[:, None, None]
         if np.square(expected).sum(axis=-1).mean() < (PARTICLE_RADIUS / 10) ** 2:

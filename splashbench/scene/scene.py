@@ -312,7 +312,7 @@ class TrainingScene:
     def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
         """Liquid mask [H, W] of a training camera at timestep `t`."""
         self._training_only(camera)
-        return self._pictures.get("mask", camera, t, self._scene.mask)
+        return self._pictures.mask(camera, t, self._scene.mask)
 
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
         """Container mask [H, W] of a training camera, or None."""

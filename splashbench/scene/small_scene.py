@@ -43,7 +43,7 @@ class SmallScene(TrainingScene):
     def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
         """Liquid mask [H, W] of a training camera at timestep `t`."""
         self._training_only(camera)
-        return self._pictures.get("mask", camera, t, lambda name, at: self._mostly(name, self._large.mask(name, at)))
+        return self._pictures.mask(camera, t, lambda name, at: self._mostly(name, self._large.mask(name, at)))
 
     def container_mask(self, camera: str) -> NDArray[np.bool_] | None:
         """Container mask [H, W] of a training camera, or None."""

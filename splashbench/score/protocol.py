@@ -87,7 +87,8 @@ def score_submission(
         preset=identity.preset,
         settings=identity.settings,
         overrides=tuple(identity.overrides),
-        told=scene.stated,
+        # Container masks and the like may have come after the run: no file that the scene's digest is of.
+        told=scene.stated if identity.told is None else identity.told,
         control=identity.control,
         mixed=identity.mixed,
         withheld=identity.withheld,

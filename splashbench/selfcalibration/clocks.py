@@ -46,8 +46,12 @@ _MUCH_CLEARER = 1.3
 _LEAST_CAMERAS = 3
 # Offsets below are no offsets, in timesteps.
 _SAME = 0.03
-# Triples of droplets in one view that are looked at, at the most.
-_MOST_TRIPLES = 4_000_000
+# Of one mask, the droplets that are looked at at most, the largest of all; triples of them in three frames, and flights
+# through one frame, those first that are mistaken for the fewest others. Votes take the square of flights, and these
+# the cube of droplets.
+_MOST_DROPLETS, _MOST_TRIPLES, _MOST_FLIGHTS = 80, 4_000_000, 400
+# Part of a timestep within which two views' flights meet, or are none of each other.
+_NEAR = 0.52
 
 
 @dataclass(frozen=True)
@@ -182,9 +186,13 @@ def _flights(
         fallen = np.clip(bend @ fall / length, -0.5 * scale, most * scale)
         astray = np.linalg.norm(bend - fallen[..., None] * fall / length, axis=-1)
         which, third = np.nonzero((astray < _OFF_PATH * scale) & _flown(now, after, scale)[second])
+        others = np.bincount(second[which], minlength=len(now))[second[which]]
+        if len(which) > _MOST_FLIGHTS:
+            kept = np.sort(np.argsort(others, kind="stable")[:_MOST_FLIGHTS])
+            which, third, others = which[kept], third[kept], others[kept]
         frames.append(np.full(len(which), t))
         places.append(np.stack([before[first[which]], now[second[which]], after[third]], axis=1))
-        alike.append(np.bincount(second[which], minlength=len(now))[second[which]])
+        alike.append(others)
     if not frames:
         return _Flights(np.zeros(0, np.intp), np.zeros((0, 3, 2)), np.zeros(0, np.intp))
     return _Flights(np.concatenate(frames), np.concatenate(places), np.concatenate(alike))
@@ -217,6 +225,10 @@ def droplets_of(masks: Iterable[NDArray[np.bool_]], camera: Camera) -> list[NDAr
         whole = (left > 0) & (top > 0) & (left + width < mask.shape[1]) & (top + height < mask.shape[0])
         small = whole & (area <= _LARGEST * scale**2)
         small[0] = False  # what is not liquid
+        if small.sum() > _MOST_DROPLETS:
+            largest = np.argsort(np.where(small, -area, 1), kind="stable")[:_MOST_DROPLETS]
+            small = np.zeros_like(small)
+            small[largest] = True
         found.append(np.asarray(middles[small] + 0.5))
         often += cv2.dilate(image, disc)
     most = max(2.0, _OFTEN * len(found))
@@ -246,25 +258,29 @@ def _votes(first: Camera, second: Camera, of_first: _Flights, of_second: _Flight
             other = there[of_second.frame == t + n]
             if not len(other):
                 continue
-            distance = other[None, :, 1] - place[:, None]
-            after = np.zeros_like(distance)
-            for _ in range(4):  # Newton's steps to where the path crosses the plane
-                pace = speed[:, None] + fall[:, None] * after
-                pace = np.where(np.abs(pace) < 0.3 * scale, np.copysign(0.3 * scale, pace), pace)
-                gone = speed[:, None] * after + 0.5 * fall[:, None] * after**2
-                after = np.clip(after - (gone - distance) / pace, -1, 1)
-            pace = speed[:, None] + fall[:, None] * after
             other_pace = (other[:, 2] - other[:, 0]) / 2
             other_fall = other[:, 2] - 2 * other[:, 1] + other[:, 0]
-            alike = (
-                (np.abs(after) <= 0.52)
-                & (np.abs(pace) > _SLOWEST * scale)
-                & (np.abs(other_pace - pace) < _ALIKE * scale)
-                & (np.abs(other_fall - fall[:, None]) < _ALIKE_FALL * scale)
+            # Most fly otherwise whenever they meet, and are left out before it is asked when.
+            rows, columns = np.nonzero(
+                (np.abs(other_fall - fall[:, None]) < _ALIKE_FALL * scale)
+                & (np.abs(other_pace - speed[:, None]) < (_ALIKE + 1e-6) * scale + _NEAR * np.abs(fall)[:, None])
             )
-            rows, columns = np.nonzero(alike)
+            distance, began, bent = other[columns, 1] - place[rows], speed[rows], fall[rows]
+            after = np.zeros(len(rows))
+            for _ in range(4):  # Newton's steps to where the path crosses the plane
+                pace = began + bent * after
+                pace = np.where(np.abs(pace) < 0.3 * scale, np.copysign(0.3 * scale, pace), pace)
+                gone = began * after + 0.5 * bent * after**2
+                after = np.clip(after - (gone - distance) / pace, -1, 1)
+            pace = began + bent * after
+            alike = (
+                (np.abs(after) <= _NEAR)
+                & (np.abs(pace) > _SLOWEST * scale)
+                & (np.abs(other_pace[columns] - pace) < _ALIKE * scale)
+            )
             mine_too, others_too = np.flatnonzero(of_first.frame == t), np.flatnonzero(of_second.frame == t + n)
-            found.append(np.stack([after[alike] - n, mine_too[rows], others_too[columns]], axis=1))
+            chosen = after[alike] - n, mine_too[rows[alike]], others_too[columns[alike]]
+            found.append(np.stack(chosen, axis=1))
     if not found:
         return np.zeros((0, 2))
     votes = np.concatenate(found)

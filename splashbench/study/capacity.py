@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from splashbench.errors import SplashbenchError
+from splashbench.harness.devices import CPU
 from splashbench.harness.discovery import load_method
 from splashbench.study.job import ERROR, Store
 from splashbench.study.knee import Rung
@@ -53,12 +54,15 @@ def make_capacity_plan(
     base: Mapping[str, Any] | None = None,
     seeds: Sequence[int] = (0,),
     timeout_seconds: float | None = None,
+    device: str = CPU,
+    gpu_elsewhere: bool | None = None,
 ) -> CapacityPlan:
     """The runs of `method` on `scenes` on every rung.
 
     Args:
         ladder: each SETTING=V1,V2,...; empty for the method's own.
         base: settings of every rung, on top of the preset.
+        device, gpu_elsewhere: what the method runs on, see `make_plan`.
 
     Raises SplashbenchError, one line, for a method, preset, setting, value or scene that does not exist or is wrong.
     """
@@ -81,8 +85,9 @@ def make_capacity_plan(
         variants=tuple(StudyVariant(name=name, settings=climbed.settings(number)) for name, number in rungs.items()),
         reference=None,
         timeout_seconds=timeout_seconds,
+        device=device,
     )
-    return CapacityPlan(make_plan(spec), climbed, rungs)
+    return CapacityPlan(make_plan(spec, gpu_elsewhere), climbed, rungs)
 
 
 def smallest_first(

@@ -25,9 +25,11 @@ from splashbench.harness.devices import AUTO, CPU
 from splashbench.harness.estimates import duration
 from splashbench.score.image.lpips import WEIGHTS_VARIABLE, load_lpips
 from splashbench.score.image.weights import weights_path
+from splashbench.score.result import Result
 from splashbench.study.commit import commit, commit_failure, new_attempt, recover
 from splashbench.study.job import ERROR, Attempt, Job, RunEntry, Store, carry_out, carry_out_file
 from splashbench.study.plan import PlannedRun, StudyPlan
+from splashbench.study.scenes import changes
 
 _MARK = ".splashbench_study"
 #: How often a run is started whose worker or machine is lost each time.
@@ -36,6 +38,8 @@ _TRIES = 5
 _ARRIVAL_SECONDS = 5.0
 #: Without a line for so long, the user is told how far runs are that are being made; so many of them.
 _SILENT_SECONDS, _SHOWN_RUNS, _LOG_TAIL_BYTES = 60.0, 3, 4096
+#: What a scene states of itself, of `Scene.stated`, whatever harm is done to its recording.
+_LASTING = frozenset({"container masks", "container mesh", "sparse points"})
 #: Runs that may wait for a machine of their kind while others start.
 _AHEAD = 100
 #: What the processes have imported that runs are forked off.
@@ -101,6 +105,11 @@ def carry_out_plan(plan: StudyPlan, out: Path, options: ExecutionOptions) -> Tal
     Raises SplashbenchError where `out` holds other files, where another study runs in it, and for a full disk.
     """
     store, options = Store(out), replace(options, lpips_weights=_weights(options))
+    if options.gpus and all(run.device == CPU for run in plan.runs):
+        options.tell(
+            "note: --gpus does nothing here: no run is on a GPU, as no method uses one, no machine has one, or the "
+            "device is cpu"
+        )
     for planned in plan.scenes:
         if store.out.resolve().is_relative_to(planned.scene.directory.resolve()):
             raise SplashbenchError(f"{out} lies in the scene {planned.scene.directory}; give a place outside it")
@@ -196,11 +205,24 @@ def _is_missing(run: PlannedRun, store: Store, with_lpips: bool, retry: bool, tr
     if result is None:
         return True
     return (
-        (with_lpips and result.value("lpips") is None)
+        _told_otherwise(run, entry, result)
+        or (with_lpips and result.value("lpips") is None)
         or (run.timing_frames > 0 and result.value("render_fps") is None)
         or (run.variant.unseen is not None and store.faded(entry) is None)
         or (training and (entry.training is None or (retry and entry.training.status != "ok")))
     )
+
+
+def _told_otherwise(run: PlannedRun, entry: RunEntry, result: Result) -> bool:
+    """Whether container masks, points or the like have come or gone since the run, of which no digest tells."""
+    scene = run.scene.scene
+    if result.told is None:
+        return False
+    if changes(scene, run.variant, run.seed) is None:
+        return result.told != scene.stated
+    # Harm takes away other things, and with a camera its masks.
+    lasting = _LASTING.intersection(result.told), _LASTING.intersection(scene.stated)
+    return entry.train_views == list(scene.train) and lasting[0] != lasting[1]
 
 
 def _job(

@@ -77,7 +77,7 @@ class StudyPlan:
 
 
 def make_plan(spec: StudySpec, gpu_elsewhere: bool | None = None) -> StudyPlan:
-    """The runs of `spec`, seed by seed. All that can be wrong before a run starts is reported here.
+    """The runs of `spec`, on its `device`, seed by seed. All that can be wrong before a run starts is reported here.
 
     gpu_elsewhere: whether one of the other machines that make the runs has a GPU (`cluster.place.has_gpu`); None where
     this one makes them.

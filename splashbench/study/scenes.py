@@ -62,7 +62,8 @@ def changed_scene(scene: Scene, variant: StudyVariant, seed: int, cache: Path) -
     changed = changes(scene, variant, seed)
     if changed is None:
         return scene
-    text = json.dumps([scene.digest, changed], sort_keys=True)
+    # What is stated besides may come later, and the digest says nothing of it.
+    text = json.dumps([scene.digest, changed, scene.stated], sort_keys=True)
     # The folder keeps its name: without scene.json it decides what a scene is (Table S1).
     place = cache / hashlib.sha256(text.encode()).hexdigest()[:16] / scene.directory.resolve().name
     place.parent.parent.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splashbench.errors import SplashbenchError
+from splashbench.harness.devices import CPU
 from splashbench.harness.discovery import load_method
 from splashbench.harness.runner import parse_overrides
 from splashbench.scene import Scene
@@ -82,11 +83,14 @@ def make_stress_plan(
     levels: Sequence[int] = (1, 2, 3, 4, 5),
     seeds: Sequence[int] = (0,),
     timeout_seconds: float | None = None,
+    device: str = CPU,
+    gpu_elsewhere: bool | None = None,
     thin: Callable[[Scene], Scene] = lambda scene: scene,
 ) -> StressPlan:
     """The runs of `methods` (each METHOD[:PRESET][:KEY=VALUE,...]) on `scenes`, as recorded and with every harm.
 
-    thin: makes of each scene the one that is used (thinning.py).
+    device, gpu_elsewhere: what methods run on, see `make_plan`. thin: makes of each scene the one that is used
+    (thinning.py).
 
     Raises SplashbenchError, one line, for a method, preset, scene or kind that does not exist, and where no harm is
     left.
@@ -124,8 +128,9 @@ def make_stress_plan(
         variants=tuple(variants),
         reference=None,
         timeout_seconds=timeout_seconds,
+        device=device,
     )
-    return StressPlan(make_plan(spec), tuple(labels), rows, tuple(harms), tuple(left_out))
+    return StressPlan(make_plan(spec, gpu_elsewhere), tuple(labels), rows, tuple(harms), tuple(left_out))
 
 
 def stress_runs(stress: StressPlan, store: Store, metric: str) -> tuple[list[StressRun], dict[tuple[str, int], float]]:

@@ -24,6 +24,8 @@ _LARGEST_INTEGER, _MAX_NESTING = 2**63 - 1, 24
 MAX_NOTE, MAX_NOTES = 500, 50
 #: Letters of a preset's name or a version, and figures that a submitter claims, at most.
 MAX_NAME, MAX_CLAIMS = 200, 1000
+#: States of a fit on its way: their folders have two digits.
+MAX_CHECKPOINTS = 100
 #: Figures by the names that records and results had before version 0.2 -> today's names.
 RENAMED_FIGURES = {"carriers_per_frame": "particles_per_frame"}
 
@@ -104,6 +106,9 @@ class Identity(BaseModel):
     device: _Text = "cpu"
     scene: _Text
     scene_digest: str = Field(pattern=r"^[0-9a-f]{64}$")
+    #: What the scene stated besides images, masks and cameras when the run began (`Scene.stated`), of which its digest
+    #: says nothing; null where it was not noted.
+    told: tuple[_Text, ...] | None = Field(default=None, max_length=100)
     control: bool = False
     mixed: bool = False
     #: Timesteps that the method did not see; only they are scored (withheld.py).
@@ -147,7 +152,7 @@ class Record(BaseModel):
     #: seconds of the fit's stages, where the method tells them
     stages: dict[str, Annotated[float, Field(ge=0, le=_MAX_COST)]] = Field(default_factory=dict)
     #: states of the fit on its way, in the order of their seconds
-    checkpoints: list[Checkpoint] = Field(default_factory=list, max_length=100)
+    checkpoints: list[Checkpoint] = Field(default_factory=list, max_length=MAX_CHECKPOINTS)
     #: seconds that saving them took, which fit_seconds leaves out; null where none were asked for
     checkpoint_seconds: float | None = Field(default=None, ge=0, le=_MAX_COST)
     #: what the method found out by itself and went by

@@ -229,7 +229,7 @@ def make_scene(
         (staging / "truth").mkdir()
         _true_particles(trajectory, shown).save(staging / "truth" / "particles.npz")
         container = recipe.container.mesh()
-        write_mesh(staging / "truth" / "container.ply", container.vertices, container.faces)
+        write_mesh(staging / "truth" / "container.ply", container.vertices, container.outward_faces)
     return Scene.open(out)
 
 

@@ -88,9 +88,12 @@ class CameraLayer(Layer):
 
     def ahead(self, moment: Moment) -> Job | None:
         """The next photograph that is missing."""
-        if not self.on or len(self._small) >= self._most:
+        if not self.on:
             return None
-        jobs = (self._missing((moment.t + k) % self._n_frames) for k in range(self._n_frames))
+        # A timestep that was begun is completed, also where there is no room to begin another.
+        begins = len(self._small) < self._most
+        steps = ((moment.t + k) % self._n_frames for k in range(self._n_frames))
+        jobs = (self._missing(t) for t in steps if begins or t in self._small)
         return next((job for job in jobs if job is not None), None)
 
     def _missing(self, t: int) -> Job | None:

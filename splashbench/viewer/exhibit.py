@@ -288,7 +288,7 @@ class SubmissionExhibit(Exhibit):
         return None if scene is None else scene.container_mesh()
 
     def _particles(self) -> Particles | None:
-        return self.reconstruction.submission.particles()
+        return self.reconstruction.particles()
 
     def gaussians(self, t: int) -> Gaussians | None:
         """The method's, coloured as seen from the training cameras' mean place."""

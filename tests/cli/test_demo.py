@@ -75,12 +75,24 @@ def test_a_gate_passes_on_its_side_of_the_limit(value: float | None, at_most: bo
 
 
 def test_a_folder_becomes_the_demos_only_where_it_is_empty(tmp_path: Path) -> None:
-    demo._claim(tmp_path / "out")
-    demo._claim(tmp_path / "out")
+    demo._claim(tmp_path / "out", 0, fresh=False)
+    demo._claim(tmp_path / "out", 0, fresh=False)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "holiday.jpg").write_bytes(b"dear")
     with pytest.raises(SplashbenchError, match="holds files that are not the demo's"):
-        demo._claim(tmp_path / "photos")
+        demo._claim(tmp_path / "photos", 0, fresh=True)
+
+
+def test_outputs_of_another_seed_or_version_are_not_shown_as_those_of_this_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    demo._claim(out, 0, fresh=False)
+    with pytest.raises(SplashbenchError, match=r"holds the demo of seed 0, .*, and this is seed 1, .* add --fresh"):
+        demo._claim(out, 1, fresh=False)
+    demo._claim(out, 1, fresh=True)
+    demo._claim(out, 1, fresh=False)
+    (out / demo._MARK).write_text("Made by `splashbench demo`, which may replace everything here.\n")
+    with pytest.raises(SplashbenchError, match="holds the demo of an earlier version"):
+        demo._claim(out, 1, fresh=False)
 
 
 def test_the_demo_ends_with_a_video_and_all_its_commands_exist(

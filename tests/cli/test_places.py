@@ -10,7 +10,7 @@ import pytest
 
 from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
-from splashbench.files import files_together
+from splashbench.files import as_asked, files_together
 
 Fails = Callable[..., str]
 
@@ -103,6 +103,29 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
         (staging / "first").write_text("whole")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["first", "mine"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_files_come_together_into_a_folder_whose_own_folder_is_nobodys_to_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as a scene that is mounted: nothing can be renamed into it from beside it."""
+    out = tmp_path / "out"
+    out.mkdir()
+    made: list[Path] = []
+    make = Path.mkdir
+
+    def noting(path: Path, *words: object, **how: object) -> None:
+        made.append(path)
+        make(path, *words, **how)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Path, "mkdir", noting)
+    with files_together(out) as staging:
+        assert staging.parent == out
+        (staging / "first").write_text("whole")
+        with pytest.raises(SplashbenchError, match=rf"{out}/second is a folder"):
+            raise SplashbenchError(as_asked(f"{staging / 'second'} is a folder"))
+    assert [path for path in made if path.parent == tmp_path and path != out] == []
+    assert [path.name for path in out.iterdir()] == ["first"]
 
 
 def test_files_that_belong_together_do_not_come_in_part(tmp_path: Path) -> None:

@@ -161,6 +161,9 @@ def test_a_folder_for_screenshots_that_is_a_file_is_refused(
         (["a", "--time", "nan"], "'nan' is not a number of seconds"),
         (["a", "--port", "0"], "'0' is not a whole number from 1 to 65535"),
         (["a", "b", "--screenshot", "c.png", "--size", "451x300"], "--size: a width of 451 does not halve"),
+        (["a", "--size", "450x300"], "--size is for --screenshot"),
+        (["a", "--screenshot", "c.png", "--port", "8090"], "--port would do nothing with --screenshot"),
+        (["a", "--screenshot", "c.png", "--save-to", "b"], "--save-to would do nothing with --screenshot"),
     ],
 )
 def test_wrong_usage(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,6 +18,7 @@ from splashbench import toml
 from splashbench.container.clicked_points import ClickedPoint, place_by_points
 from splashbench.container.contours import find_contour
 from splashbench.container.placement import Placement, place_by_silhouettes, up_from_container
+from splashbench.container.stance import CentredMesh
 from splashbench.container.verification import overlay, silhouette, verify
 from splashbench.errors import SplashbenchError
 from splashbench.prepare.session import Session
@@ -269,6 +270,21 @@ def test_clicked_points_place_the_container(scale: float | None) -> None:
     assert errors(mesh, finer.pose, truth)[1] < 0.3
 
 
+def test_clicked_points_take_what_is_up_from_gravity() -> None:
+    """Most scans have z up, and clicks say nothing of it."""
+    truth, cameras = pose(213), rig()
+    clicked = clicks(truth, cameras[:5])
+    lying = Rotation.from_euler("x", 90, degrees=True).as_matrix()  # z of the file is what y was
+    vertices = tank().vertices @ lying.T
+    turned = [replace(click, point=tuple((lying @ click.point).tolist())) for click in clicked]
+    mesh = replace(tank(), vertices=vertices)
+    found = place_by_points(mesh, cameras, turned, gravity=(0.0, -1.0, 0.0))
+    assert found.up_axis == "z"
+    assert found.up[1] > 0.999
+    assert place_by_points(mesh, cameras, turned, up="y", gravity=(0.0, -1.0, 0.0)).up_axis == "y"
+    assert place_by_points(mesh, cameras, turned).up_axis == "y"
+
+
 def test_four_points_in_one_camera_do_with_the_scale_known() -> None:
     truth, cameras = pose(20), rig()
     found = place_by_points(tank(), cameras, clicks(truth, cameras[:1]), metres_per_unit=1.0)
@@ -369,3 +385,18 @@ def test_faults_of_the_description_are_one_line(tmp_path: Path, container: dict[
     with pytest.raises(SplashbenchError, match=message) as caught:
         Session.open(session_with(tmp_path, container))
     assert "\n" not in str(caught.value)
+
+
+def test_an_outline_along_the_border_alone_is_none() -> None:
+    column = np.zeros((60, 80), bool)
+    column[:, 0] = True
+    full_but_one_row = np.ones((60, 80), bool)
+    full_but_one_row[-1] = False
+    for mask in (column, full_but_one_row):
+        assert find_contour(mask).points.shape == (0, 2)
+
+
+def test_a_mesh_without_area_is_one_line() -> None:
+    line = ContainerMesh(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[0, 1, 2]]))
+    with pytest.raises(SplashbenchError, match="has no area"):
+        CentredMesh.of(line)

@@ -466,3 +466,16 @@ def test_a_damaged_note_says_that_it_may_be_removed(tmp_path: Path) -> None:
     (tmp_path / STATE_FILE).write_text("{")
     with pytest.raises(SplashbenchError, match=r"scenes\.json cannot be read.*remove it"):
         check_downloaded(tmp_path, "scene", made=True, again=False, tell=lambda text: None)
+
+
+@pytest.mark.parametrize("words", [["bowl_001"], ["bowl_001", "Tank_002"]])
+def test_a_scene_is_not_taken_for_the_folder(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a folder the last name would be one, and the whole archive fetched into it."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(["download", "scenes", *words])
+    assert stop.value.code == 2
+    assert f"{words[-1]} is a scene; DIR comes behind the names" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -42,6 +42,8 @@ def test_l1_and_its_gradient(image: torch.Tensor, share: float) -> None:
     rng = np.random.default_rng(1)
     photograph = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     seen = rng.random((HEIGHT, WIDTH)) < share
+    with pytest.raises(ValueError, match="does not compare"):
+        l1(image[..., :1], photograph[..., :1], seen)  # the kernel goes by three channels
     expected, value = l1(image, photograph, seen), _l1_by_torch(image, photograph, seen)
     assert float(value.detach()) == pytest.approx(float(expected.detach()), abs=1e-6)
     (theirs,), (ours,) = torch.autograd.grad(expected, image), torch.autograd.grad(value, image)

@@ -10,7 +10,7 @@ import time as clock
 from collections.abc import Callable
 from pathlib import Path
 
-from splashbench.harness.channel import FIT_ENDS, SAVED, Channel
+from splashbench.harness.channel import FIT_ENDS, GOES_ON, PAUSED, SAVED, Channel
 from splashbench.harness.contract import Fitted, Render, Run
 from splashbench.scene import Camera, Particles, TrainingScene
 
@@ -54,6 +54,47 @@ class EndsTwice(Good):
         channel().mark(FIT_ENDS)
         clock.sleep(1)
         return super().fit(scene, config, run)
+
+
+class ClaimsPauses(Good):
+    """Says that a state is saved while it fits."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        line = channel()
+        line.mark(PAUSED)
+        clock.sleep(1)
+        line.mark(GOES_ON)
+        return super().fit(scene, config, run)
+
+
+class LeavesPipeForLog(Good):
+    """Puts pipes where the harness reads what is printed, and how far the fit is."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        for name in ("log", "progress"):
+            (run.directory.parent / name).unlink(missing_ok=True)
+            os.mkfifo(run.directory.parent / name)
+        return super().fit(scene, config, run)
+
+
+class LeavesFolderForLog(Good):
+    """Puts folders there."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        for name in ("log", "progress"):
+            (run.directory.parent / name).unlink(missing_ok=True)
+            (run.directory.parent / name).mkdir()
+        return super().fit(scene, config, run)
+
+
+class OffersMilestones(Good):
+    """Calls every step one behind which nothing comes for long."""
+
+    def fit(self, scene: TrainingScene, config: _Settings, run: Run) -> Fitted:
+        fitted = super().fit(scene, config, run)
+        for _ in range(130):
+            run.checkpoint(lambda: fitted, milestone=True)
+        return fitted
 
 
 class ClaimsOverhead(Good):

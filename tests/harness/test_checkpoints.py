@@ -253,7 +253,7 @@ def test_the_command_takes_states_of_a_long_fit_only(
 
 
 def test_the_oracle_has_no_fit(balls_directory: Path, tmp_path: Path) -> None:
-    with pytest.raises(SplashbenchError, match="no presets, settings or fit"):
+    with pytest.raises(SplashbenchError, match="no presets, settings, seeds, device, model or fit"):
         run_method("oracle", balls_directory, tmp_path / "out", checkpoints=MARKS)
 
 

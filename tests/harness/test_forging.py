@@ -7,16 +7,18 @@ import tempfile
 import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from splashbench.errors import SplashbenchError
-from splashbench.harness import clock, leftovers
+from splashbench.harness import clock, leftovers, phases
 from splashbench.harness.clock import Report, fit_time, frames_per_second, state_seconds
 from splashbench.harness.keeper import _Line
 from splashbench.harness.messages import Outcome
 from splashbench.harness.runner import run_method
-from splashbench.submission import Status, Submission
+from splashbench.submission import Checkpoint, Status, Submission
+from splashbench.submission.identity import MAX_CHECKPOINTS
 
 METHODS = Path(__file__).with_name("forging_methods.py")
 
@@ -53,6 +55,35 @@ def test_time_that_a_method_deducts_is_not_believed(balls_directory: Path, tmp_p
     assert record.fit_seconds is not None
     assert 1.0 <= record.fit_seconds < 30
     assert record.reused == {}
+
+
+@pytest.mark.parametrize("checkpoints", [None, (1e6,)])
+def test_pauses_in_which_nothing_was_saved_count(
+    balls_directory: Path, tmp_path: Path, checkpoints: tuple[float, ...] | None
+) -> None:
+    record = _run("ClaimsPauses", balls_directory, tmp_path / "out", checkpoints=checkpoints).record
+    assert record.fit_seconds is not None
+    assert 1.0 <= record.fit_seconds < 30
+    assert not record.checkpoint_seconds
+
+
+@pytest.mark.parametrize("name", ["LeavesPipeForLog", "LeavesFolderForLog"])
+def test_whatever_lies_in_the_place_of_the_log_is_not_waited_for(
+    name: str, balls_directory: Path, tmp_path: Path
+) -> None:
+    assert _run(name, balls_directory, tmp_path / "out", timeout_seconds=60).status == Status.OK
+
+
+def test_states_beyond_those_that_a_record_has_room_for_are_not_taken(
+    balls_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def not_rendered(*of: Any) -> Checkpoint:
+        return Checkpoint(seconds=of[-1], folder=f"checkpoints/{of[-2]:02d}")
+
+    monkeypatch.setattr(phases, "_checkpoint", not_rendered)
+    submission = _run("OffersMilestones", balls_directory, tmp_path / "out", checkpoints=(1e6,))
+    assert submission.status == Status.OK
+    assert len(submission.record.checkpoints) == MAX_CHECKPOINTS
 
 
 def test_renders_that_are_told_and_not_there_are_incomplete(balls_directory: Path, tmp_path: Path) -> None:
@@ -133,8 +164,8 @@ def test_a_frame_rate_is_what_the_time_of_all_frames_allows() -> None:
     assert frames_per_second(report, 70.0, 110) == 70.0
     assert frames_per_second(report, 1e6, 110) == 55.0
     assert frames_per_second(_report(), 70.0, 110) is None
-    # Both marks came at once: too short to be seen from outside.
-    assert frames_per_second(_report(("timing starts", 1.0), ("timing ends", 1.0)), 70.0, 110) == 70.0
+    # Marks that were kept back, and told at once.
+    assert frames_per_second(_report(("timing starts", 1.0), ("timing ends", 1.0)), 1e9, 110) is None
 
 
 def test_a_mark_is_stamped_by_when_it_comes_and_not_by_what_it_tells() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_json
+from splashbench.harness.messages import lacks_memory
 from splashbench.harness.runner import parse_overrides, run_method
 from splashbench.scene import Scene
 from splashbench.submission import Status, Submission, check_submission
@@ -130,8 +131,9 @@ def test_wrong_names_and_settings_are_told_before_anything_runs(balls_directory:
         _run("Good", balls_directory, tmp_path / "out", preset="fast")
     with pytest.raises(SplashbenchError, match="method good runs on cpu, not on 'banana'"):
         _run("Good", balls_directory, tmp_path / "out", device="banana")
-    with pytest.raises(SplashbenchError, match="the oracle is the truth itself"):
-        run_method("oracle", balls_directory, tmp_path / "out", preset="quick")
+    for useless in ({"preset": "quick"}, {"exr": True}, {"seed": 1}, {"device": "cuda"}, {"timeout_seconds": 9.0}):
+        with pytest.raises(SplashbenchError, match="the oracle is the truth itself"):
+            run_method("oracle", balls_directory, tmp_path / "out", **useless)
     with pytest.raises(SplashbenchError, match="this method's settings: blue"):
         _run("Good", balls_directory, tmp_path / "out", overrides={"green": 1})
     assert list(tmp_path.iterdir()) == []
@@ -166,3 +168,18 @@ def test_the_log_of_a_crash_is_kept(balls_directory: Path, tmp_path: Path) -> No
 def test_a_mistyped_setting_names_the_near_one(balls_directory: Path, tmp_path: Path) -> None:
     with pytest.raises(SplashbenchError, match=r"setting iteratons: .*; did you mean iterations\?"):
         run_method("splashsplat", balls_directory, tmp_path / "out", overrides={"iteratons": 3})
+
+
+@pytest.mark.parametrize(
+    ("said", "lacks"),
+    [
+        ("CUDA out of memory. Tried to allocate 2.00 GiB", True),
+        ("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes", True),
+        ("OpenCV(4.11) error: (-4:Insufficient memory) in function 'OutOfMemoryError'", True),
+        ("Unable to allocate 2.00 TiB for an array with shape (9, 9)", True),
+        ("[Errno 12] Cannot allocate memory", True),
+        ("index 9 is out of bounds", False),
+    ],
+)
+def test_the_words_of_libraries_for_no_memory(said: str, lacks: bool) -> None:
+    assert lacks_memory(said) is lacks

@@ -106,10 +106,10 @@ def test_every_gate_says_what_to_do() -> None:
         *intrinsics_gates({"1": calibration(50.0, 0.1, 9.0)}),
         *sync_gates({"1": clock(1.0)}, SequenceSync(1.0, {}, ("1",))),
         *sampling_gates(Sampling(np.zeros(1), np.zeros(1), {}, {}, {"1": np.ones(1, bool)})),
-        *pose_gates(poses, ["1", "2"], 480),
+        *pose_gates(poses, {"1": 480, "2": 480}),
         *metric_gates(frame),
         *mask_gates({"1": mask_health([0, 0], 1000)}, 2),
-        *container_gates(placed(GOOD | {"1": 0.1, "2": 0.1}), ["1", "2", "3"], 1920),
+        *container_gates(placed(GOOD | {"1": 0.1, "2": 0.1}), ["1", "2", "3"], dict.fromkeys("12367", 1920)),
         source_gate({"1": 0.5}),
     ]
     assert len(gates) > 25
@@ -154,7 +154,7 @@ def test_pose_gates_count_cameras_and_sweep() -> None:
         rms_error_px=0.4,
         n_observations=500,
     )
-    found = {gate.name: gate for gate in pose_gates(poses, ["1", "2", "3"], 480)}
+    found = {gate.name: gate for gate in pose_gates(poses, dict.fromkeys("123", 480))}
     assert not found["cameras_posed"].passed
     assert found["cameras_posed"].essential
     assert found["mean_reprojection"].passed
@@ -259,12 +259,12 @@ GOOD = {"1": 0.98, "2": 0.97, "3": 0.99, "6": 0.96, "7": 0.95}
     ],
 )
 def test_container_gates(container: PlacedContainer, failed: list[str]) -> None:
-    gates = container_gates(container, ["1", "2", "3"], 1920)
+    gates = container_gates(container, ["1", "2", "3"], dict.fromkeys("12367", 1920))
     assert [gate.name for gate in gates if not gate.passed] == failed
 
 
 def test_only_another_container_or_senseless_clicks_stop() -> None:
-    other = container_gates(placed(dict.fromkeys(GOOD, 0.5)), ["1", "2", "3"], 1920)
+    other = container_gates(placed(dict.fromkeys(GOOD, 0.5)), ["1", "2", "3"], dict.fromkeys("12367", 1920))
     assert [gate.name for gate in other if gate.essential and not gate.passed] == ["container_is_the_container"]
-    senseless = container_gates(placed({}, point_rms_px={"1": 60.0}), ["1"], 1920)
+    senseless = container_gates(placed({}, point_rms_px={"1": 60.0}), ["1"], dict.fromkeys("12367", 1920))
     assert [gate.name for gate in senseless if gate.essential and not gate.passed] == ["container_clicks_fit"]

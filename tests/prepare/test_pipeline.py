@@ -7,6 +7,7 @@ lens.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from fractions import Fraction
 from pathlib import Path
@@ -182,6 +183,64 @@ def test_only_the_own_unfinished_scene_is_removed(session: Path) -> None:
     assert not left.exists()
 
 
+@pytest.mark.parametrize("what", ["note", "stage folder", "camera", "pipe"])
+def test_nothing_is_written_or_deleted_through_links_in_the_work_folder(session: Path, what: str) -> None:
+    """It comes with the session, which may be a stranger's."""
+    with pytest.raises(SplashbenchError):
+        prepare(session, session.parent / "scene")  # makes the work folder
+    mine = session.parent / "mine"
+    (mine / "1").mkdir(parents=True)
+    (mine / "letter.txt").write_text("dear")
+    (mine / "1" / "letter.txt").write_text("dear")
+    work = session / "prepare"
+    shutil.rmtree(work / "intrinsics", ignore_errors=True)
+    if what == "note":
+        (work / "unfinished_scene.txt").unlink(missing_ok=True)
+        (work / "unfinished_scene.txt").symlink_to(mine / "letter.txt")
+    elif what == "stage folder":
+        (work / "intrinsics").symlink_to(mine, target_is_directory=True)
+    elif what == "camera":
+        (work / "intrinsics").mkdir()
+        (work / "intrinsics" / "1.json").symlink_to(mine / "letter.txt")
+    else:
+        (work / "sync.json").unlink(missing_ok=True)
+        os.mkfifo(work / "sync.json")
+    with pytest.raises(SplashbenchError, match="is a link, pipe or device, which no stored result is; remove it"):
+        prepare(session, session.parent / "scene")
+    assert [path.read_text() for path in sorted(mine.rglob("letter.txt"))] == ["dear", "dear"]
+
+
+def test_a_scene_may_have_a_name_that_is_no_text(session: Path) -> None:
+    place = session.parent / os.fsdecode(b"caf\xe9")
+    place.mkdir()
+    with pytest.raises(SplashbenchError, match="ChArUco"):
+        prepare(session, place / "scene")
+    assert list(place.iterdir()) == []
+
+
+def test_links_in_a_circle_are_a_file_that_does_not_exist(session: Path) -> None:
+    path = session / "cameras/1/pour.MP4"
+    path.unlink()
+    path.symlink_to(path.name)
+    fails(session, r"cameras/1/pour\.MP4 .*does not exist")
+
+
+def test_chapters_of_a_board_clip_are_of_one_size(session: Path) -> None:
+    write_clip(session / "cameras/1/other.MP4", seconds=1.0, size=(2 * WIDTH, 2 * HEIGHT))
+    recordings = toml.load(session / "session.toml")["recordings"]
+    recordings["intrinsics"]["1"] = ["cameras/1/intrinsics.MP4", "cameras/1/other.MP4"]
+    edit(session, recordings=recordings)
+    fails(session, r"cameras/1/other\.MP4 differs in size or codec from .*intrinsics\.MP4")
+
+
+def test_options_of_a_scene_are_refused_where_none_is_made(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["--timesteps", "9"], ["--masks", "background"], ["--no-crop"], ["--work", "elsewhere"]):
+        with pytest.raises(SystemExit) as caught:
+            main(["prepare", str(session), "--init", *words])
+        assert caught.value.code == 2
+        assert f"{words[0]} would do nothing" in capsys.readouterr().err
+
+
 def test_faults_of_later_stages_are_told_first(session: Path, tmp_path: Path) -> None:
     def fault(pattern: str, **changes) -> None:
         edit(session, **changes)
@@ -193,9 +252,12 @@ def test_faults_of_later_stages_are_told_first(session: Path, tmp_path: Path) ->
     (session / "bowls").mkdir()
     fault(r"bowl\.ply is not a readable mesh", container={"mesh": "bowl.ply", "masks": "bowls"})
     trimesh.creation.box().export(session / "bowl.ply")
-    fault("no mask of a training camera")
+    fault("0 training cameras have a container mask")
     write_png(session / "bowls/1.png", np.zeros((4, 4), np.uint8))
     fault(r"bowls/1\.png is 4x4, the recording is 128x72")
+    for name, content in (("1", np.full((72, 128), 255, np.uint8)), ("2", np.zeros((72, 128), np.uint8))):
+        write_png(session / f"bowls/{name}.png", content)
+    fault(r"1 training camera has a container mask .* that is not empty, two are needed")
     clicks = [{"point": [k, 0, k * k], "pixels": {"1": [10 + k, 900 * (k == 2)]}} for k in range(3)]
     fault(r"point 3 lies at \(12, 900\) in camera 1", container={"mesh": "bowl.ply", "points": clicks})
     fault(r"unknown marker dictionary", container=None, marker={"dictionary": "DICT_NOPE", "id": 1, "metres": 0.1})

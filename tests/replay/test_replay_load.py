@@ -143,6 +143,41 @@ def test_a_method_that_is_not_installed_shows_its_stored_views(copy: Path, balls
         splashbench.load(copy, method="splashsplat")
 
 
+def test_stored_views_of_a_run_that_withheld_timesteps_are_of_the_time_asked_for(
+    balls: Scene, balls_directory: Path, tmp_path: Path
+) -> None:
+    """Renders bear the numbers of all timesteps, and what the method saw are every second one."""
+    out = write_oracle(balls, tmp_path / "oracle").directory
+    resealed(out, withheld="odd")
+    opened = splashbench.load(out, scene=balls_directory)
+    name = balls.test[0]
+    np.testing.assert_allclose(opened.times, balls.times[::2])
+    for t in (0, 2, 4):
+        render = opened.render(name, float(balls.camera_times[name][t]))
+        np.testing.assert_array_equal(to_8bit(render.rgb), balls.image(name, t))
+
+
+def test_a_model_that_fails_is_told_in_one_line(fit: Path) -> None:
+    opened = splashbench.load(fit)
+
+    def fails(*given: object) -> None:
+        raise IndexError("index 9 is out of bounds")
+
+    time = float(opened.times[1])
+    asked = {
+        "gaussians": lambda: opened.gaussians(time),
+        "static_gaussians": opened.static_gaussians,
+        "surface": lambda: opened.surface(time),
+        "velocity": lambda: opened.velocity(time),
+        "render": lambda: opened.render(opened.train[0], time),
+        "empty_view": lambda: opened.empty_view(opened.train[0]),
+    }
+    for name, ask in asked.items():
+        setattr(opened.fitted, name, fails)
+        with pytest.raises(SplashbenchError, match=r"method splashsplat cannot give .*IndexError: index 9 is out of"):
+            ask()
+
+
 @pytest.mark.slow
 def test_a_fit_to_some_timesteps_is_opened_with_those(balls_directory: Path, tmp_path: Path, balls: Scene) -> None:
     out = tmp_path / "withheld"

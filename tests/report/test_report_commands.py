@@ -10,7 +10,7 @@ import pytest
 
 from splashbench.cli import leaderboard, score
 from splashbench.errors import SplashbenchError
-from splashbench.files import read_image
+from splashbench.files import read_image, write_png
 from splashbench.harness.oracle import write_oracle
 from splashbench.scene import Scene
 from splashbench.score import Result
@@ -111,3 +111,51 @@ def test_the_submission_opened_is_the_one_scored(runs: dict[str, Path], balls: S
     result = Result.load(path)
     assert result.digests.submission == Submission.open(runs["oracle"]).digest
     assert result.digests.scene == balls.digest
+
+
+def test_what_a_verification_has_no_use_for_is_refused(
+    runs: dict[str, Path], balls: Scene, tmp_path: Path, capsys: Any
+) -> None:
+    words = ["score", tmp_path / "a.json", "--scene", balls.directory, "--verify"]
+    for flag, value in (("--out", tmp_path), ("--sheet", tmp_path / "a.png"), ("--set", "outside_mask=truth")):
+        with pytest.raises(SystemExit):
+            command(*words, flag, value)
+        assert f"{flag} is not for --verify" in capsys.readouterr().err
+
+
+def test_a_verification_uses_the_reference(runs: dict[str, Path], balls: Scene, tmp_path: Path, capsys: Any) -> None:
+    results, reference = tmp_path / "results", runs["nothing"]
+    words = ["--scene", balls.directory, "--reference", reference]
+    assert command("score", runs["oracle"], *words, "--out", results) == 0
+    (result,) = results.glob("*.json")
+    verify = ["score", result, "--scene", balls.directory, "--submissions", runs["oracle"], "--verify"]
+    assert command(*verify) == 0
+    assert "for want of weights or of the reference: dpsnr_bg" in capsys.readouterr().err
+    assert command(*verify, "--reference", reference) == 0
+    assert "dpsnr_bg" not in capsys.readouterr().err
+
+
+def test_what_a_run_was_told_is_what_its_scene_stated_then(balls_directory: Path, tmp_path: Path) -> None:
+    """Container masks may come later: no digest is of them."""
+    import shutil
+
+    place = Path(shutil.copytree(balls_directory, tmp_path / "balls"))
+    before = Scene.open(place)
+    told_before = before.stated
+    assert "container masks" not in told_before
+    write_oracle(before, tmp_path / "oracle")
+    (place / "container_mask").mkdir()
+    for name in before.train:
+        write_png(place / "container_mask" / f"{name}.png", before.mask(name, 0).astype("uint8") * 255)
+    after = Scene.open(place)
+    assert "container masks" in after.stated
+    assert after.digest == before.digest
+    words = ["--scene", place, "--out", tmp_path / "results"]
+    assert command("score", tmp_path / "oracle", *words) == 0
+    write_oracle(after, tmp_path / "told")
+    assert command("score", tmp_path / "told", *words) == 0
+    told = {Result.load(path).told for path in (tmp_path / "results").glob("*.json")}
+    assert told == {told_before, after.stated}
+    # Neither replaces the other.
+    assert command("leaderboard", tmp_path / "results", tmp_path / "board") == 0
+    assert (tmp_path / "board" / "leaderboard.csv").read_text().count("oracle,") == 2

@@ -48,3 +48,24 @@ def test_a_training_scene_gives_what_the_files_hold(balls: Scene, monkeypatch: p
     assert larger._pictures._pictures is None
     monkeypatch.setattr(kept_pictures, "MAX_KEPT_BYTES", 4 * 64 * 96 * 5 * 8)
     assert balls.training()._pictures._pictures == {}
+
+
+def test_masks_of_a_large_scene_are_kept_packed(monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[int] = []
+    masks = np.random.default_rng(0).random((3, 13, 17)) < 0.5
+
+    def read(camera: str, t: int) -> np.ndarray:
+        reads.append(t)
+        return masks[t].copy()
+
+    kept = KeptPictures(kept_pictures.MAX_KEPT_BYTES + 1)
+    for t in (0, 1, 0, 1, 0):
+        mask = kept.mask("1", t, read)
+        np.testing.assert_array_equal(mask, masks[t])
+        assert mask.dtype == bool
+        mask[:] = False  # nobody spoils it
+    assert reads == [0, 1]
+    monkeypatch.setattr(kept_pictures, "MAX_PACKED_BYTES", kept._packed_bytes)
+    for _ in range(2):
+        np.testing.assert_array_equal(kept.mask("1", 2, read), masks[2])
+    assert reads == [0, 1, 2, 2]

@@ -43,6 +43,7 @@ class FakeSubmission:
             seed=self.seed,
             scene=self.scene.name,
             scene_digest=self.scene_digest or self.scene.digest,
+            told=None,
             control=self.control,
             mixed=self.mixed,
             withheld=None,

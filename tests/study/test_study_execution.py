@@ -113,8 +113,10 @@ def test_how_many_gpus_a_run_has(
     balls_directory: Path, tmp_path: Path, place: Place, there: bool, asked: int | None, expected: int
 ) -> None:
     place.gpus = 4
-    options = ExecutionOptions(on="ray", jobs=None, gpus=asked)
+    said: list[str] = []
+    options = ExecutionOptions(on="ray", jobs=None, gpus=asked, tell=said.append)
     carry_out_plan(plan(balls_directory, "auto", there), tmp_path / "out", options)
+    assert any("--gpus does nothing here" in line for line in said) is (asked == 2 and not there)
     assert {needs.gpus for name, needs in place.started if name in "abc"} == {expected}
     assert {needs.gpus for name, needs in place.started if name in "def"} == {0}
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from splashbench.cli.main import main
+from splashbench.files import write_png
+from splashbench.scene import Scene
 from splashbench.study.stress import make_stress_plan
 
 METHODS = Path(__file__).with_name("study_methods.py")
@@ -129,3 +133,26 @@ def test_timesteps_that_a_scene_cannot_do_without_are_left_out(balls_directory: 
     ]
     unseen = {run.variant.unseen for run in plan.plan.runs}
     assert unseen == {None, "keep_1_of_2", "keep_1_of_6"}
+
+
+def test_runs_that_were_told_otherwise_are_made_again(balls_directory: Path, tmp_path: Path) -> None:
+    """Container masks that come later are hints which no digest is of."""
+    scene, out = Path(shutil.copytree(balls_directory, tmp_path / "balls")), tmp_path / "out"
+    command = ["study", "stress", str(out), "--methods", GREY, "--scenes", str(scene)]
+    command += ["--kinds", "exposure", "missing_cameras", "--severities", "1"]
+
+    def made() -> int:
+        before = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*.json")}
+        assert main(command) == 0
+        return sum(before.get(path) != path.stat().st_mtime_ns for path in (out / "runs").glob("*.json"))
+
+    everything = made()
+    assert everything > 3
+    assert made() == 0
+    (scene / "container_mask").mkdir()
+    opened = Scene.open(scene)
+    for name in opened.train:
+        write_png(scene / "container_mask" / f"{name}.png", opened.mask(name, 0).astype(np.uint8) * 255)
+    again = made()
+    assert again >= everything - 1  # where a camera is missing nobody knows
+    assert made() == 0

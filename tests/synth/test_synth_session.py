@@ -12,10 +12,12 @@ from splashbench.cli.main import main
 from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray
 from splashbench.prepare.session import Session
+from splashbench.prepare.video.recording import Recording
 from splashbench.synth.recording.audio import SAMPLE_RATE, SPEED_OF_SOUND, clap, interpolate
 from splashbench.synth.recording.plan import CAMERAS, CHAPTERED, RecordingOptions, make_plan
 from splashbench.synth.recording.session import make_session
 from splashbench.synth.recording.truth import Truth
+from splashbench.synth.recording.video import write_recording
 
 av = pytest.importorskip("av")
 
@@ -140,6 +142,17 @@ def test_liquid_changes_the_frames_where_the_mask_says(small_session: Path) -> N
         difference = np.abs(frames[int(path.stem)] - background).max(axis=2)
         assert np.median(difference[mask]) > 40
         assert np.median(difference[~mask]) < 6
+
+
+def test_colours_come_back_as_they_were_filmed(tmp_path: Path) -> None:
+    """A file that does not state its matrix is decoded by another, with a cast of ten levels."""
+    blue, brown = (20, 60, 180), (212, 172, 133)
+    image = np.zeros((64, 96, 3), np.uint8)
+    image[:, :48], image[:, 48:] = blue, brown
+    write_recording(tmp_path / "a.mp4", [image] * 3, 30, np.zeros(4800, np.float32))
+    (_, seen), *_ = Recording([tmp_path / "a.mp4"]).frames()
+    assert np.abs(seen[10:54, 10:40].astype(int) - blue).max() <= 3
+    assert np.abs(seen[10:54, 58:86].astype(int) - brown).max() <= 3
 
 
 def test_a_frame_of_the_board_shows_the_board(small_session: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 pytest.importorskip("embreex")
 
@@ -50,11 +51,11 @@ def ball(centre: tuple[float, float, float], radius: float) -> Mesh:
 
 
 def disagreement(room: CaptureRoom) -> float:
-    """Median difference of two views' colours over points of the basin's inside that both see, in sRGB units of 1."""
+    """Median difference of two views' colours over points of the basin's outside that both see, in sRGB units of 1."""
     assert room.bowl is not None
     traced = TracedRoom(room)
-    inside = room.bowl.vertices[room.bowl.normals[:, 1] > 0.3]
-    points = inside[np.hypot(inside[:, 0], inside[:, 2]) < 0.095]
+    outside = room.bowl.vertices[room.bowl.normals[:, 1] > 0.3]  # normals point into the clay
+    points = outside[np.hypot(outside[:, 0], outside[:, 2]) < 0.095]
     colors, seen = [], np.ones(len(points), bool)
     for fraction in (0.1, 0.9):
         lens = camera(fraction)
@@ -73,10 +74,13 @@ def test_a_bowl_is_closed_and_its_wall_nowhere_thin(shape: BowlShape) -> None:
     mesh = bowl_mesh(shape, segments=96, rings=48)
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     assert {tuple(edge) for edge in edges} == {tuple(edge) for edge in edges[:, ::-1]}
-    # A ray that enters the clay square to its surface stays in it for millimetres.
-    down = mesh.vertices - 1e-4 * mesh.normals
-    depth = Tracer([(mesh.vertices, mesh.faces)]).nearest(down, -mesh.normals).distance
-    assert depth[mesh.vertices[:, 1] > 0.001].min() > 0.004
+    assert trimesh.Trimesh(mesh.vertices, mesh.outward_faces, process=False).volume > 0
+    # A ray that enters the clay square to its surface stays in it for millimetres, and leaves it again.
+    into = mesh.normals
+    depth = Tracer([(mesh.vertices, mesh.faces)]).nearest(mesh.vertices + 1e-4 * into, into).distance
+    away_from_the_table = mesh.vertices[:, 1] > 0.001
+    assert depth[away_from_the_table].min() > 0.004
+    assert depth[away_from_the_table].max() < 0.1
 
 
 def test_the_new_bowls_are_of_other_shapes() -> None:

@@ -81,7 +81,7 @@ def test_all_frames_come_in_order_when_they_are_asked_for(ball: Reconstruction) 
 )
 def test_a_method_that_fails_is_one_line(rgb: np.ndarray | None, fault: str, ball: Reconstruction) -> None:
     ball.fitted.render = lambda camera, time: Render(rgb, np.zeros((64, 96), np.float32))  # type: ignore
-    with pytest.raises(SplashbenchError, match=f"method oracle cannot render .*{fault}"):
+    with pytest.raises(SplashbenchError, match=f"method oracle cannot give the view of camera .*{fault}"):
         make_film(ball, PLAIN).frame(1)
 
 

@@ -334,6 +334,7 @@ def test_photographs_of_a_long_recording_are_not_all_kept(stage: Stage, server: 
     layer._most = 2  # type: ignore[attr-defined]
     finish(stage)
     assert sorted(layer._small) == [0, 1]  # type: ignore[attr-defined]
+    assert layer.loading is None  # type: ignore[attr-defined]
     stage.show(Moment(3, False))
     finish(stage)
     assert sorted(layer._small) == [1, 3]  # type: ignore[attr-defined]

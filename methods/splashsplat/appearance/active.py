@@ -63,6 +63,8 @@ class ActiveCarriers:
         self._left: list[Tensor | None] = [None for _ in frames]
         # By the target's identity: its frame, and which of this one's carriers that are left make up some of it, int32.
         self._focus: dict[int, tuple[int, Tensor]] = {}
+        # By frame and part of a step: see `_phi_of`.
+        self._phi: dict[tuple[int, float], np.ndarray] = {}
 
     def of(self, target: TrainingTarget) -> Active:
         """What `target` teaches."""
@@ -74,13 +76,20 @@ class ActiveCarriers:
         if target.hidden is not None:
             visibility = 1 - chosen(target.hidden, taught).to(torch.float32) / HIDDEN
         # Made anew each time: states of all frames would hold hundreds of megabytes on large scenes.
-        state = self._track.state(t, target.fraction, None if taught is None else taught.numpy())
+        phi = None if target.fraction == 0 else self._phi_of(t, target.fraction)
+        state = self._track.state(t, target.fraction, None if taught is None else taught.numpy(), phi)
         state = replace(state, visibility=visibility)
         numbers = chosen(self._cells[t], places)
         # Cells of which none is left count one, as nothing may be divided by zero.
         sizes = torch.bincount(numbers).clamp_min(1).to(torch.float32)
         in_front = None if target.in_front is None else chosen(target.in_front, taught)
         return Active(chosen(self.ids[t], places), places, state, ColorCells(numbers, sizes), in_front)
+
+    def _phi_of(self, t: int, fraction: float) -> np.ndarray:
+        """Of all carriers of frame `t` as they are between frames; kept, as it takes two whole frames of distances."""
+        if (t, fraction) not in self._phi:
+            self._phi[t, fraction] = self._track.distances(t, fraction)
+        return self._phi[t, fraction]
 
     def _places(self, target: TrainingTarget) -> Tensor | None:
         """int64, which of the target's frame's carriers that are left it teaches; None for all."""

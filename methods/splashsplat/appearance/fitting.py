@@ -107,21 +107,23 @@ class Appearance:
 
 
 #: Given the number of a target, features and log-scales of all carriers, and by how much the opacity of each is
-#: multiplied (float32 [count], None for 1): the window as these would show it, and its photograph.
-Drawn = Callable[[int, Tensor, Tensor, Tensor | None], tuple[Tensor, WindowPhotograph]]
+#: multiplied (float32 [count], None for 1): the window as these would show it.
+Drawn = Callable[[int, Tensor, Tensor, Tensor | None], Tensor]
 
 
 @dataclass(frozen=True)
 class Fit:
     """losses: of every iteration; `begun` others came before. left: bool [count], the carriers that were fitted to the
     end. sensitivity: of the photographs to what was learned; None where it was not asked for. drawn: see `Drawn`.
-    photographs: how many targets. earned: what stretches of iterations bought, where that decided how many there were.
+    photograph: of a target, by its number, which may have to be read. photographs: how many targets. earned: what
+    stretches of iterations bought, where that decided how many there were.
     """
 
     losses: list[float]
     left: np.ndarray
     sensitivity: Sensitivity | None
     drawn: Drawn
+    photograph: Callable[[int], WindowPhotograph]
     photographs: int
     earned: tuple[Earned, ...] = ()
     begun: int = 0
@@ -340,9 +342,7 @@ def fit_appearance(
         return so_far.to(CPU), carriers.left(track.carriers.count)
 
     @torch.no_grad()
-    def drawn(
-        number: int, every_feature: Tensor, every_scale: Tensor, opacity: Tensor | None
-    ) -> tuple[Tensor, WindowPhotograph]:
+    def drawn(number: int, every_feature: Tensor, every_scale: Tensor, opacity: Tensor | None) -> Tensor:
         target = targets[number].to(device)
         active = carriers.of(targets[number])
         if opacity is not None:
@@ -351,7 +351,10 @@ def fit_appearance(
         values = [table.index_select(0, active.ids).to(device) for table in (every_feature, every_scale)]
         active = active.to(device)
         children, _ = decoder.decode(values[0], values[1], None, active.state, target.eye)
-        return shown(children, replace(target, modes=None), active)[0].cpu(), read_now(target.photograph)
+        return shown(children, replace(target, modes=None), active)[0].cpu()
+
+    def photograph_of(number: int) -> WindowPhotograph:
+        return read_now(targets[number].photograph)
 
     def sized(target: TrainingTarget, iteration: int) -> TrainingTarget:
         """`target` in the size that it has at `iteration`."""
@@ -461,6 +464,7 @@ def fit_appearance(
         carriers.left(track.carriers.count),
         None if measured is None else measured.found(),
         drawn,
+        photograph_of,
         len(targets),
         tuple(schedule.earned) if isinstance(schedule, EarningSchedule) else (),
         settings.begun,

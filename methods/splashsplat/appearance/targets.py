@@ -37,6 +37,8 @@ MASK_MARGIN = 8
 HIDDEN = 255
 # A photograph taken this near to its frame's time, as a share of the step, is taken as taken then.
 SAME_TIME = 0.01
+# So many steps before the first timestep or after the last one a photograph still shows that timestep's liquid, about.
+_BESIDE = 0.5
 
 
 @dataclass
@@ -164,6 +166,12 @@ def windowed(image: Tensor, corner: tuple[int, int], camera: Camera) -> Tensor:
     return image[y : y + camera.height, x : x + camera.width]
 
 
+def _is_beyond(times: np.ndarray, time: float) -> bool:
+    """Whether nothing is fitted that was to be seen at `time`."""
+    beside = _BESIDE * float(np.diff(times).mean()) if len(times) > 1 else np.inf
+    return not times[0] - beside <= time <= times[-1] + beside
+
+
 def collect_targets(
     scene: TrainingScene,
     backgrounds: dict[str, np.ndarray],
@@ -176,7 +184,8 @@ def collect_targets(
     frozen: Mapping[str, Frozen] | None = None,
     blocks: int = 1,
 ) -> list[TrainingTarget]:
-    """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target.
+    """All pairs whose mask is not empty and trusted, and whose frame has carriers; a failed mask is no target, and no
+    photograph that a camera took before the first timestep or after the last one, at its own time.
 
     backgrounds: float32 [H, W, 3] or [3] of each training view. camera_times: whether a photograph shows the liquid at
     its camera's own time; by default at the scene's. trusted: bool [T, V], by default all. hidden: given a view's name
@@ -205,6 +214,8 @@ def collect_targets(
         taken = scene.camera_times[name] if camera_times else scene.times
         for t, mask in enumerate(masks):
             if not mask.any() or (trusted is not None and not trusted[t, view]):
+                continue
+            if camera_times and _is_beyond(scene.times, float(taken[t])):
                 continue
             frame, fraction = locate(scene.times, float(taken[t]))
             fraction = fraction if abs(fraction) > SAME_TIME else 0.0

@@ -82,19 +82,35 @@ class Track:
         """Numbers of the carriers of frame `t`, int64 [n]."""
         return torch.from_numpy(self.carriers.ids[self.carriers.rows(t)].astype(np.int64))
 
-    def state(self, t: int, fraction: float = 0.0, places: np.ndarray | None = None) -> CarrierState:
+    def state(
+        self, t: int, fraction: float = 0.0, places: np.ndarray | None = None, phi: np.ndarray | None = None
+    ) -> CarrierState:
         """Decoder input of frame `t`'s carriers, a `fraction` in (-1, 1) of a step after the frame; see `locate`.
 
-        places: int64 [n], which of the frame's carriers; None for all.
+        places: int64 [n], which of the frame's carriers; None for all. phi: `distances` of all of them, where these are
+        known already.
         """
         positions, deformation = self.moved(t, fraction, places)
-        phi = _at(self.carriers.phi[self.carriers.rows(t)], places)
-        if fraction != 0 and len(positions):
-            other = t + 1 if fraction > 0 else t - 1
-            nearer, farther = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
-            phi = ((1 - abs(fraction)) * nearer + abs(fraction) * farther).astype(np.float32)
+        if phi is not None:
+            phi = _at(phi, places)
+        elif fraction != 0 and len(positions):
+            phi = self._distances(t, fraction, positions)
+        else:
+            phi = _at(self.carriers.phi[self.carriers.rows(t)], places)
         places = torch.from_numpy(self.grid.to_scene(positions).astype(np.float32))
         return CarrierState(places, torch.from_numpy(deformation), torch.from_numpy(phi))
+
+    def distances(self, t: int, fraction: float) -> np.ndarray:
+        """phi of `state` alone, float32 [n], of all of frame `t`'s carriers."""
+        positions, _ = self.moved(t, fraction, None)
+        if fraction == 0 or not len(positions):
+            return self.carriers.phi[self.carriers.rows(t)]
+        return self._distances(t, fraction, positions)
+
+    def _distances(self, t: int, fraction: float, positions: np.ndarray) -> np.ndarray:
+        other = t + 1 if fraction > 0 else t - 1
+        nearer, farther = (sample(self.phi[frame], positions) / STEPS_PER_VOXEL for frame in (t, other))
+        return np.asarray((1 - abs(fraction)) * nearer + abs(fraction) * farther, np.float32)
 
     def positions(self, t: int, fraction: float = 0.0) -> np.ndarray:
         """The positions of `state` alone, float32 [n, 3]."""

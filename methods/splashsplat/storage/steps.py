@@ -52,7 +52,7 @@ class Storage:
         self._scratch = self._exact[0].clone(), self._exact[1].clone()
         rng = np.random.default_rng([seed, 6])
         self._photographs = sorted(rng.permutation(fit.photographs)[:_PHOTOGRAPHS].tolist())
-        self._loss = Loss(fit.drawn, self._photographs, self._exact)
+        self._loss = Loss(fit.drawn, fit.photograph, self._photographs, self._exact)
 
     def within_tolerance(self, tolerance: float) -> tuple[Stored, Decision]:
         """The longest step whose rounding adds no more than `tolerance` to the squared error in some training

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..appearance.fitting import Drawn
+from ..kernel.window_loss import WindowPhotograph
 
 # Trials at most, once one is within the tolerance.
 _TRIALS = 6
@@ -33,35 +34,45 @@ class Trial:
     against: float
 
 
+@dataclass(frozen=True)
+class _Within:
+    """Of a photograph, by its mask. box, mask: where that is in the window. truth: its own colours, [n, 3]. exact:
+    those of the render before anything is stored, [n, 3]."""
+
+    box: tuple[slice, slice]
+    mask: Tensor
+    truth: Tensor
+    exact: Tensor
+
+
 class Loss:
-    """What renders of some photographs lose. drawn: of `Fit`; numbers: of the photographs; exact: features and
-    log-scales of all carriers before they are stored."""
+    """What renders of some photographs lose. drawn, photograph: of `Fit`; numbers: of the photographs, each of which is
+    read once; exact: features and log-scales of all carriers before they are stored."""
 
     def __init__(
         self,
         drawn: Drawn,
+        photograph: Callable[[int], WindowPhotograph],
         numbers: Sequence[int],
         exact: tuple[Tensor, Tensor],
     ) -> None:
-        self._drawn, self._numbers = drawn, numbers
-        self._exact = {number: self._inside(number, exact) for number in numbers}
-        self._without = sum(float((image - truth).square().sum()) for image, truth in self._exact.values())
-        self._count = sum(image.numel() for image, _ in self._exact.values())
-
-    def _inside(self, number: int, values: tuple[Tensor, Tensor], shown: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Render and photograph within the mask, [n, 3] each."""
-        image, photograph = self._drawn(number, *values, shown)
-        truth = photograph.image[photograph.mask].to(torch.float32) / 255
-        return image[photograph.box][photograph.mask].clamp(0, 1), truth
+        self._drawn, self._within = drawn, dict[int, _Within]()
+        for number in numbers:
+            of = photograph(number)
+            truth = of.image[of.mask].to(torch.float32) / 255
+            image = drawn(number, *exact, None)[of.box][of.mask].clamp(0, 1)
+            self._within[number] = _Within(of.box, of.mask, truth, image)
+        self._without = sum(float((each.exact - each.truth).square().sum()) for each in self._within.values())
+        self._count = sum(each.truth.numel() for each in self._within.values())
 
     def of(self, step: float, values: tuple[Tensor, Tensor], shown: Tensor | None = None) -> Trial:
         """What is lost with `values`, which were stored with `step`. shown: float32 [count], 0 for carriers that are
         left out; None for all."""
         other, error = 0.0, 0.0
-        for number, (image, truth) in self._exact.items():
-            stored, _ = self._inside(number, values, shown)
-            other += float((stored - image).square().sum())
-            error += float((stored - truth).square().sum())
+        for number, within in self._within.items():
+            stored = self._drawn(number, *values, shown)[within.box][within.mask].clamp(0, 1)
+            other += float((stored - within.exact).square().sum())
+            error += float((stored - within.truth).square().sum())
         return Trial(step, other / max(self._without, 1e-12), self._decibels(error), self._decibels(other))
 
     def _decibels(self, squares: float) -> float:

@@ -80,6 +80,9 @@ def read_track(
     control = arrays["motion"]["velocities"]
     if control.shape[0] != max(n_frames - 1, 0) or control.shape[4] != 3 or min(control.shape[1:4]) < 2:
         raise ValueError(f"velocities of shape {control.shape} do not fit {n_frames} frames")
+    births = arrays["carriers"]["births"]
+    if births.shape != (n_frames,):
+        raise ValueError(f"births of shape {births.shape} do not fit {n_frames} frames")
     if phi.shape != (n_frames, *grid.shape):
         raise ValueError(f"phi is of shape {phi.shape}, not of {n_frames} frames on {grid.shape} nodes")
     motion = _read_motion(arrays["motion"], grid, times, factor, precision)

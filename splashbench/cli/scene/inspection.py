@@ -8,6 +8,7 @@ import json
 from splashbench.cli.arguments import add_scene
 from splashbench.cli.command import add_command
 from splashbench.cli.output import emit, report_faults
+from splashbench.errors import one_line
 
 _CHECK_EPILOG = """\
 example:
@@ -64,5 +65,5 @@ def info(arguments: argparse.Namespace) -> int:
         emit(facts)
     else:
         for key, value in facts.items():
-            print(f"{key:18} {value if isinstance(value, str) else json.dumps(value)}")
+            print(f"{key:18} {one_line(value) if isinstance(value, str) else json.dumps(value)}")
     return 0

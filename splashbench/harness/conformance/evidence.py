@@ -91,7 +91,7 @@ class Evidence:
             method=self.name,
             preset=self.preset,
             overrides=self.overrides,
-            device=device,
+            device=self.device,
             timeout_seconds=timeout_seconds,
         )
         if scene is not None:

@@ -161,6 +161,8 @@ def _answer(order: Order, answer: Answer, reporter: _Reporter) -> None:
     else:
         answer.ended_in = "load"
         fitted = method.load(Path(order.model), scene)
+    answer.ended_in = "to_device"
+    fitted.to_device(order.subject.device)
     answer.ended_in = "render"
     answer.views = rendered_views(fitted, requests)
     answer.particles = returned_particles(fitted, scene.n_frames)

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splashbench.files import tree_bytes
+from splashbench.files import remove_any, tree_bytes
 from splashbench.harness.external.collection import collect
 from splashbench.harness.external.commands import command_line
-from splashbench.harness.messages import Failure, Request
+from splashbench.harness.messages import Failure, Request, lacks_memory
 from splashbench.harness.phases import particles_per_frame, run_phase
 from splashbench.harness.training_copy import make_training_copy
 from splashbench.harness.watched_process import Watched, watch
@@ -185,7 +185,7 @@ class ExternalRun:
     def _command(self, phase: str, command: str) -> Watched:
         """Run `command` under observation. Raises Failure unless it comes through."""
         progress = self.scratch / "progress"
-        progress.unlink(missing_ok=True)
+        remove_any(progress)
         watched = watch(
             command_line(command, self._values, self.code.shell, self.code.directory.resolve()),
             log=self.scratch / f"{phase}.log",
@@ -200,7 +200,7 @@ class ExternalRun:
         if watched.exit_code in _KILLED:
             raise Failure(Status.OUT_OF_MEMORY, f"the {phase} was killed (signal 9), as when memory runs out")
         if watched.exit_code != 0:
-            lacking = [line for line in watched.log_tail if "out of memory" in line.lower()]
+            lacking = [line for line in watched.log_tail if lacks_memory(line)]
             last = (lacking or watched.log_tail or ["it said nothing"])[-1]
             raise Failure(
                 Status.OUT_OF_MEMORY if lacking else Status.CRASHED,

@@ -145,6 +145,7 @@ def _identity(code: ExternalCode, scene: Scene, preset: str, seed: int, device: 
             device=device,
             scene=scene.name,
             scene_digest=scene.digest,
+            told=scene.stated,
             splashbench_version=__version__,
             hardware=hardware.describe(device),
         )

@@ -25,6 +25,7 @@ from splashbench.errors import SplashbenchError
 from splashbench.files import read_gray
 from splashbench.prepare.masks.provider import MASK_THRESHOLD, Mask
 from splashbench.progress import track
+from splashbench.scene.neurofluid import is_neurofluid
 
 SCENE_MARK = "train_meta.json"
 # A folder with more is none of masks; reading them would take days.
@@ -103,6 +104,12 @@ def find_mask_sets(folder: Path) -> list[MaskSet]:
     folder = Path(folder)
     if not folder.is_dir():
         raise SplashbenchError(f"{folder} is not a folder; give a scene, or a folder of masks <camera>/<frame>.png")
+    # Photographs of a view lie as masks do elsewhere.
+    if is_neurofluid(folder) or any(any(place.glob("transforms_*.json")) for place in (folder, folder.parent)):
+        raise SplashbenchError(
+            f"{folder} is of a scene in NeuroFluid's layout, which keeps its masks within its photographs; "
+            "give a folder of masks <camera>/<frame>.png"
+        )
     single = _mask_set(folder)
     if single is not None:
         return [single]

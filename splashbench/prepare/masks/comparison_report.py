@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splashbench.csv_cells import csv_text
 from splashbench.files import atomic_path, read_image, write_text
 from splashbench.prepare.masks.comparison import (
     MaskChange,
@@ -41,7 +42,11 @@ def pair_table(comparisons: Sequence[MaskComparison]) -> str:
     """CSV of every mask, areas and changes in pixels; `iou` is blank where neither mask has liquid."""
     names = ["camera", "frame", "n_pixels", "raw_area", "refined_area", "added", "removed"]
     rows = [
-        [comparison.scene, *(getattr(pair, name) for name in names), "" if pair.iou is None else f"{pair.iou:.6f}"]
+        [
+            csv_text(comparison.scene),
+            *(csv_text(value) if isinstance(value := getattr(pair, name), str) else value for name in names),
+            "" if pair.iou is None else f"{pair.iou:.6f}",
+        ]
         for comparison in comparisons
         for pair in comparison.all_pairs
     ]
@@ -51,7 +56,7 @@ def pair_table(comparisons: Sequence[MaskComparison]) -> str:
 def change_table(rows: Mapping[tuple[str, str], MaskChange]) -> str:
     """CSV of the figures of each camera, scene and all; blank where nothing has liquid."""
     names = [field.name for field in fields(MaskChange)]
-    body = [[*key, *(_plain(getattr(change, name)) for name in names)] for key, change in rows.items()]
+    body = [[*map(csv_text, key), *(_plain(getattr(change, name)) for name in names)] for key, change in rows.items()]
     return _csv(["scene", "camera", *names], body)
 
 

@@ -164,13 +164,18 @@ def sheet_of_set(
     missed, remarks = _missed(masks, frames)
     faults = mask_faults(areas, {camera: shape[0] * shape[1] for camera, shape in shapes.items()}, missed)
     times = sheet_times(len(frames), faults, columns)
+    if len(masks.files) * len(times) > _MAX_CELLS:
+        raise SplashbenchError(
+            f"{masks.folder}: {len(masks.files)} cameras with {len(times)} timesteps each are more than the "
+            f"{_MAX_CELLS} pictures that a sheet has room for; give fewer --columns, or a folder of fewer cameras"
+        )
     rows = {}
     for camera, files in track(masks.files.items(), f"sheet of {masks.name}"):
         cells = []
         for t in times:
             mask = _read_mask(files.get(frames[t]), shapes[camera])
             image = _read_frame(folder, camera, frames[t], shapes[camera])
-            cells.append(SheetCell(image, mask, faults[camera].get(t, "")))
+            cells.append(small_cell(image, mask, faults[camera].get(t, "")))
         rows[camera] = cells
     sheet = mask_sheet(
         f"{masks.name}: masks of {len(rows)} cameras, {len(frames)} frames",

@@ -63,6 +63,9 @@ def _of_videos(videos: Mapping[str, Recording], detector: Detector, reference: s
     audio = {camera: (sound.samples, sound.start_s) for camera, sound in tracks.items()}
     clocks = sync.estimate_sync(audio, AUDIO_RATE, reference)
     sync.require_synced(clocks, {camera: recording.paths[0] for camera, recording in videos.items()})
+    for recording in videos.values():
+        recording.forget_sound()
+    del tracks, audio
     common = {camera: clocks[camera].to_reference(recording.frame_times) for camera, recording in videos.items()}
     start, end = min(times[0] for times in common.values()), max(times[-1] for times in common.values())
     instants = np.linspace(start, end, INSTANTS + 2)[1:-1]

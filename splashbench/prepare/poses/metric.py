@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from splashbench.alignment import Similarity, triangulate, umeyama
 from splashbench.errors import SplashbenchError
-from splashbench.prepare.calibration.board import BoardView, Detector
+from splashbench.prepare.calibration.board import BoardView, Detector, collinear
 from splashbench.prepare.calibration.lens import Array, Lens
 from splashbench.prepare.calibration.marker import MarkerDetector
 from splashbench.prepare.poses.structure_from_motion import Poses
@@ -74,6 +74,10 @@ class Print:
         """Metres."""
         return float(np.hypot(*self.size))
 
+    def is_enough(self, numbers: Sequence[int]) -> bool:
+        """Whether these corners tell how the print lies: enough of them, and not all on one line."""
+        return len(numbers) >= self.needed and not collinear(self.corners[list(numbers)])
+
     def scene_points(self, numbers: Sequence[int]) -> Array:
         """Corners in the scene frame, [len(numbers), 3] metres.
 
@@ -92,10 +96,10 @@ class Sighting:
     w2c: Array
 
 
-def seen_twice(sightings: Sequence[Sighting]) -> int:
-    """How many of a print's corners two images or more show."""
-    _, counts = np.unique(np.concatenate([[], *(s.view.ids for s in sightings)]), return_counts=True)
-    return int((counts >= 2).sum())
+def is_seen_twice(sightings: Sequence[Sighting], flat: Print) -> bool:
+    """Whether two images or more show as many of a print's corners as it takes to know how it lies."""
+    ids, counts = np.unique(np.concatenate([[], *(s.view.ids for s in sightings)]), return_counts=True)
+    return flat.is_enough(ids[counts >= 2].astype(int).tolist())
 
 
 def align(sightings: Sequence[Sighting], detector: Detector) -> MetricFrame:
@@ -115,9 +119,10 @@ def align_print(sightings: Sequence[Sighting], flat: Print, upright: bool = True
         for number, ray in zip(sighting.view.ids.tolist(), rays):
             rays_of.setdefault(number, []).append((ray, sighting.w2c))
     numbers = sorted(number for number, rays in rays_of.items() if len(rays) >= 2)
-    if len(numbers) < flat.needed:
+    if not flat.is_enough(numbers):
+        in_a_line = ", all on one line" if len(numbers) >= flat.needed else ""
         raise SplashbenchError(
-            f"static scene: {len(numbers)} corners of the {flat.name} are seen twice, {flat.needed} are"
+            f"static scene: {len(numbers)} corners of the {flat.name} are seen twice{in_a_line}, {flat.needed} are"
             f" needed for metres and gravity; lay the {flat.name} flat where several cameras see it"
         )
     sfm = np.array(
@@ -132,7 +137,7 @@ def align_print(sightings: Sequence[Sighting], flat: Print, upright: bool = True
         similarity = umeyama(sfm[inliers], printed[inliers])
         residual = np.linalg.norm(similarity.apply(sfm) - printed, axis=1)
         within = residual <= OUTLIER_FACTOR * max(float(np.median(residual)), 1e-9)
-        if within.sum() < flat.needed or np.array_equal(within, inliers):
+        if not flat.is_enough(np.array(numbers)[within].tolist()) or np.array_equal(within, inliers):
             break
         inliers = within
     above = [similarity.apply_w2c(sighting.w2c) for sighting in sightings]

@@ -78,7 +78,8 @@ class RigRecordings:
                 " squares, or a ChArUco board"
             )
         self._static_pictures: dict[str, Image] = {}
-        self._sharpness: list[float] | None = None  # of all frames of the sweep, once they have been looked at
+        # Of the frames of the sweep that decode, by their numbers, once they have been looked at.
+        self._sharpness: dict[int, float] | None = None
 
     def videos(self) -> list[Recording]:
         """Every recording that is no photographs."""
@@ -116,9 +117,10 @@ class RigRecordings:
         if self.sweep is None:
             return iter(())
         if self._sharpness is None:
-            self._sharpness = [poses.sharpness_of(luma) for _, luma in self.sweep.luma(SHARPNESS_WIDTH)]
-        chosen = poses.sharpest_per_bin(self._sharpness, count)
-        return (frame for _, frame in self.sweep.frames(chosen))
+            self._sharpness = {index: poses.sharpness_of(luma) for index, luma in self.sweep.luma(SHARPNESS_WIDTH)}
+        numbers = list(self._sharpness)
+        chosen = poses.sharpest_per_bin(list(self._sharpness.values()), count)
+        return (frame for _, frame in self.sweep.frames([numbers[k] for k in chosen]))
 
     def pose(
         self, lenses: Mapping[str, Lens], work: Path, lens_covariance: Mapping[str, Array] | None = None
@@ -211,7 +213,7 @@ def sight_prints(
 
 def prints_are_seen(rig: PosedRig, session: Session, detector: Detector) -> bool:
     """Whether the board or the marker lies where it gives the scene its up."""
-    return session.marker is not None or metric.seen_twice(rig.board) >= metric.Print.of_board(detector).needed
+    return session.marker is not None or metric.is_seen_twice(rig.board, metric.Print.of_board(detector))
 
 
 def find_frame(
@@ -229,7 +231,7 @@ def find_frame(
     board = None
     flat = metric.Print.of_board(detector)
     # With a marker, or a container, the board may stand or hang anywhere, or be out of sight.
-    if metric.seen_twice(rig.board) >= flat.needed:
+    if metric.is_seen_twice(rig.board, flat):
         board = metric.align_print(rig.board, flat, upright=marker is None)
     distance = None
     if session.distance is not None:

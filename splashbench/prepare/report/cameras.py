@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from splashbench.pages.blocks import Block, Bullets, Note, Table
 from splashbench.prepare.calibration.intrinsics import COVERAGE_CELLS
-from splashbench.prepare.gates import stillness_limit
+from splashbench.prepare.gates import shown_widths, stillness_limit
 from splashbench.prepare.poses.stillness import INSTANTS
 from splashbench.prepare.preparation import Preparation
 from splashbench.prepare.report.pictures import SWEEP_COLOUR, TEST_COLOUR, TRAIN_COLOUR, chart
@@ -41,7 +41,7 @@ def cameras_section(preparation: Preparation) -> list[Block]:
             axes.invert_yaxis()  # the cameras at the bottom, as if standing among them
             axes.legend(fontsize=8)
     poses = preparation.poses
-    width = next(iter(preparation.calibrations.values())).lens.width
+    width = shown_widths(calibration.lens.width for calibration in preparation.calibrations.values())
     sweep_text = f"{len(poses.sweep_w2c)} of {poses.n_sweep} sweep frames registered." if poses.n_sweep else "No sweep."
     if poses.metres_per_unit is not None:
         sweep_text = "The cameras were placed by the board that several of them saw at once."
@@ -90,15 +90,16 @@ def cameras_section(preparation: Preparation) -> list[Block]:
 
 def stillness_section(preparation: Preparation) -> list[Block]:
     """A table of how far each camera's picture of the background moved from its static clip to the pour."""
-    limit = stillness_limit(next(iter(preparation.calibrations.values())).lens.width)
+    limits = {name: stillness_limit(calibration.lens.width) for name, calibration in preparation.calibrations.items()}
     rows = []
     for camera, seen in preparation.stillness.items():
         shifts = ["unknown" if seen[instant].px is None else f"{seen[instant].px:.2f}" for instant in INSTANTS]
-        rows.append([camera, *shifts, str(min(shift.agreeing for shift in seen.values()))])
-    header = ["camera", *(f"at the {instant} [px]" for instant in INSTANTS), "features, at least"]
+        fewest = str(min(shift.agreeing for shift in seen.values()))
+        rows.append([camera, *shifts, f"{limits[camera]:.2f}", fewest])
+    header = ["camera", *(f"at the {instant} [px]" for instant in INSTANTS), "at most [px]", "features, at least"]
     note = (
         "RMS shift of the static background, from the static clip to the pour, at three instants of the motion."
-        f" Pixels of the raw frames. Above {limit:.2f} px the camera has moved, and no scene is made."
+        " Pixels of the raw frames. Above what is allowed at most the camera has moved, and no scene is made."
     )
     return [Table(header, rows), Note(note)]
 

@@ -62,7 +62,7 @@ def find_motion(
     camera, or only one of several, sees motion.
     """
     if override is not None:
-        return MotionInterval(*override, ("given as motion_interval in session.toml",))
+        return MotionInterval(*override, ("given, by --interval or as motion_interval in session.toml",))
     chosen = list(recordings if cameras is None else cameras)
     seen: dict[str, tuple[float, float]] = {}
     reasons = []
@@ -95,6 +95,11 @@ def camera_motion(recording: Recording) -> tuple[tuple[float, float] | None, lis
     """One camera's motion in local seconds, None where nothing moves, and remarks worth reporting."""
     times = recording.frame_times
     static = [image for _, image in recording.luma(WIDTH, 0, int(np.searchsorted(times, STATIC_SECONDS)))]
+    if not static:
+        raise SplashbenchError(
+            f"{recording.paths[0]}: no frame of the first {STATIC_SECONDS:g} s can be decoded (was it cut without "
+            "encoding anew?); export it again, or set motion_interval in session.toml"
+        )
     background = _StaticBeginning(static)
     first, last = 0, len(times) - 1
     notes = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 
+from splashbench.native.memory import give_back
 from splashbench.prepare.session import Session
 from splashbench.prepare.stage_cache import FileFacts, facts_of
 from splashbench.prepare.video.recording import Recording
@@ -23,3 +24,9 @@ class PourRecordings:
     def all_files(self) -> dict[str, list[FileFacts]]:
         """Camera -> its files."""
         return {camera: self.files(camera) for camera in self.recordings}
+
+    def forget_sound(self) -> None:
+        """Hold the sound of no camera any more."""
+        for recording in self.recordings.values():
+            recording.forget_sound()
+        give_back()

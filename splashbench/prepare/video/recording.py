@@ -62,16 +62,8 @@ class Recording:
     @cached_property
     def info(self) -> VideoInfo:
         """Facts of the whole recording; frames are counted. Raises SplashbenchError when chapters do not match."""
+        self.require_one_size()
         chapters = self.headers
-        for path, chapter in zip(self.paths, chapters):
-            if (chapter.width, chapter.height, chapter.codec) != (
-                chapters[0].width,
-                chapters[0].height,
-                chapters[0].codec,
-            ):
-                raise SplashbenchError(
-                    f"{path} differs in size or codec from {self.paths[0]}; list chapters of one recording only"
-                )
         audio_excess = [chapter.audio_minus_video_s for chapter in chapters if chapter.audio_minus_video_s is not None]
         return replace(
             chapters[0],
@@ -80,6 +72,15 @@ class Recording:
             has_audio=all(chapter.has_audio for chapter in chapters),
             audio_minus_video_s=float(sum(audio_excess)) if len(audio_excess) == len(chapters) else None,
         )
+
+    def require_one_size(self) -> None:
+        """Raise SplashbenchError where chapters differ in size or codec, or cannot be read; headers alone are."""
+        first = self.headers[0]
+        for path, chapter in zip(self.paths, self.headers):
+            if (chapter.width, chapter.height, chapter.codec) != (first.width, first.height, first.codec):
+                raise SplashbenchError(
+                    f"{path} differs in size or codec from {self.paths[0]}; list chapters of one recording only"
+                )
 
     @cached_property
     def frame_times(self) -> Floats:
@@ -143,6 +144,10 @@ class Recording:
             ]
             self._audio[rate] = join_audio(self.paths, shifts, rate)
         return self._audio[rate]
+
+    def forget_sound(self) -> None:
+        """Hold no sound any more, of which half an hour takes 350 MB; what is asked for is read again."""
+        self._audio.clear()
 
 
 def _runs(indices: NDArray[np.int64], entries: NDArray[np.int64]) -> list[NDArray[np.int64]]:

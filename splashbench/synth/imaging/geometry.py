@@ -58,6 +58,13 @@ class Mesh:
     faces: NDArray[np.int32]
     normals: NDArray[np.float32]
 
+    @property
+    def outward_faces(self) -> NDArray[np.int32]:
+        """Of a closed mesh: its faces with corners anticlockwise seen from outside, as files of meshes have them."""
+        a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        inside_out = np.einsum("ij,ij->", a, np.cross(b, c)) < 0  # six times the signed volume
+        return self.faces[:, [0, 2, 1]] if inside_out else self.faces
+
 
 @dataclass(frozen=True, eq=False)
 class Quad:
@@ -150,8 +157,8 @@ def revolve(profile: Array, segments: int) -> Mesh:
     last = 1 + (len(middle) - 1) * segments
     faces.append(np.stack([last + here, np.full(segments, len(vertices) - 1), last + there], axis=1))
     triangles = np.concatenate(faces)
-    # The profile runs from the inside over the lip to the outside: this winding makes the normals point out of the
-    # clay.
+    # The profile of a bowl runs from the inside over the lip to the outside, so that normals point into the clay. To
+    # the renderer both sides are one, and other corners first would round differently; files have `outward_faces`.
     return Mesh(vertices.astype(np.float32), triangles.astype(np.int32), _vertex_normals(vertices, triangles))
 
 

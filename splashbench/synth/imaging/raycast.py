@@ -64,6 +64,8 @@ class Tracer:
     def occluded(self, origins: Points, directions: Points) -> NDArray[np.bool_]:
         """Whether anything lies along each ray [R]."""
         origins, directions = _rays(origins, directions)
+        if not len(directions):
+            return np.zeros(0, np.bool_)
         return np.asarray(self._scene.run(origins, directions, query="OCCLUDED")) != -1
 
 

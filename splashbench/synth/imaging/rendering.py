@@ -31,6 +31,7 @@ _RIM = 32  # pixels beyond the image from which a surface can still reach into i
 # What a view takes of memory for each pixel while it is set up, and what the process has beside it.
 _VIEW_PIXEL_BYTES, _PROCESS_BYTES = 750, 400 << 20
 _LONGEST_EDGE = 0.006  # metres
+_SHADOW_CELL = 0.002  # metres: by squares of this size it is told where shadows may lie
 _AT_ONCE = 1 << 19  # samples that are cast at once: all of a large image would take gigabytes
 _CROSSINGS = 6  # of the liquid's surface that are followed along a ray through clear liquid
 
@@ -195,13 +196,19 @@ class RoomView:
         pixels = np.flatnonzero(near | self._pixels_near(on_table) | self._on_bowl)
         color = self._color[pixels]
         distance = np.full(color.shape[:2], FAR, np.float32)
-        lit = self._lit[pixels]
-        darkened = np.zeros_like(lit)
-        lifted = self._lifted[pixels]
-        darkened[lit] = tracer.occluded(lifted[lit], np.broadcast_to(to_light, (int(np.count_nonzero(lit)), 3)))
-        color[darkened] = self._in_shadow(tracer, lifted[darkened], color[darkened], self._shade[pixels][darkened])
         seen = np.flatnonzero(near[pixels])
-        distance[seen], color[seen] = self._wetted(liquid, tracer, pixels[seen], color[seen])
+        hits = tracer.nearest(self._eye, self._directions[pixels[seen]].reshape(-1, 3))
+        first = hits.distance < self._distance[pixels[seen]].ravel()
+        shown = self._lit[pixels]
+        if not self.traced.room.clear_liquid:
+            shown[seen] &= ~first.reshape(-1, shown.shape[1])  # nobody sees what is behind opaque liquid
+        lifted = self._lifted[pixels][shown]
+        darkened = _may_lie_in_shadow(liquid.vertices, lifted, to_light)
+        lifted = lifted[darkened]
+        darkened[darkened] = dark = tracer.occluded(lifted, np.broadcast_to(to_light, lifted.shape))
+        shown[shown] = darkened
+        color[shown] = self._in_shadow(tracer, lifted[dark], color[shown], self._shade[pixels][shown])
+        distance[seen], color[seen] = self._wetted(liquid, tracer, pixels[seen], color[seen], hits, first)
         if self._panes is not None:
             before = self._panes.of(self._samples_of(pixels)).through(color.reshape(-1, 3), 0.0, distance.ravel())
             color = before.reshape(color.shape)
@@ -219,16 +226,20 @@ class RoomView:
         return np.asarray(shade + (color - shade) * np.exp(-dye.absorption * depth[:, None]), np.float32)
 
     def _wetted(
-        self, liquid: Mesh, tracer: Tracer, pixels: NDArray[np.int_], color: Vectors
+        self,
+        liquid: Mesh,
+        tracer: Tracer,
+        pixels: NDArray[np.int_],
+        color: Vectors,
+        hits: Hits,
+        first: NDArray[np.bool_],
     ) -> tuple[NDArray[np.float32], Vectors]:
         """How far the liquid is where samples of `pixels` see it before the room (FAR elsewhere), and its colour there.
 
-        Glass before the liquid is left out; where no liquid is seen, `color` stays.
+        hits: of these samples with the liquid; first: which of them come before the room. Glass before the liquid is
+        left out; where no liquid is seen, `color` stays.
         """
-        directions = self._directions[pixels]
-        hits = tracer.nearest(self._eye, directions.reshape(-1, 3))
-        first = hits.distance < self._distance[pixels].ravel()
-        view = directions.reshape(-1, 3)[first]
+        view = self._directions[pixels].reshape(-1, 3)[first]
         points = self._eye + hits.distance[first, None] * view
         corners, weights = liquid.faces[hits.triangle[first]], hits.weights[first]
         normal = sum(liquid.normals[corners[:, k]] * weights[:, k : k + 1] for k in range(3))
@@ -272,6 +283,31 @@ class RoomView:
         kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
         grown = cv2.dilate(marked, kernel)
         return grown[_RIM:-_RIM, _RIM:-_RIM].astype(bool).ravel()
+
+
+def _may_lie_in_shadow(vertices: Vectors, points: Vectors, to_light: Vectors) -> NDArray[np.bool_]:
+    """Which of `points` [R, 3] have a part of a liquid surface of these vertices [V, 3] near their line to the light,
+    so that it may stand before it: along all others there is none."""
+    import cv2
+
+    light = to_light.astype(np.float64)
+    across = np.cross(light, [1.0, 0.0, 0.0] if abs(light[0]) < 0.9 else [0.0, 1.0, 0.0])
+    axes = np.stack([across, np.cross(light, across)]).T / np.linalg.norm(across) / np.linalg.norm(light)
+    flat = vertices.astype(np.float64) @ axes
+    reach = int(np.ceil(_LONGEST_EDGE / _SHADOW_CELL)) + 1
+    low = flat.min(axis=0) - (reach + 1) * _SHADOW_CELL
+    sides = np.ceil((flat.max(axis=0) - low) / _SHADOW_CELL).astype(np.int64) + reach + 2
+    marked = np.zeros(sides, np.uint8)
+    at = ((flat - low) / _SHADOW_CELL).astype(np.int64)
+    marked[at[:, 0], at[:, 1]] = 1
+    # No edge of the surface is longer than _LONGEST_EDGE, so that none lies farther from all vertices.
+    grown = cv2.dilate(marked, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    place = np.floor((points.astype(np.float64) @ axes - low) / _SHADOW_CELL)
+    within = ((place >= 0) & (place < sides)).all(axis=1)
+    found = np.zeros(len(points), bool)
+    column, row = place[within].astype(np.int64).T
+    found[within] = grown[column, row] > 0
+    return found
 
 
 def _sample_means(values: Vectors) -> Vectors:

@@ -110,7 +110,7 @@ def _write_truth(plan: RecordingPlan, trajectory: Trajectory, first_seen: float,
     write_model(truth / "truth.json", file)
     _write_particles(truth / "particles.npz", plan, trajectory)
     bowl = bowl_mesh()
-    write_mesh(truth / "container.ply", bowl.vertices, bowl.faces)
+    write_mesh(truth / "container.ply", bowl.vertices, bowl.outward_faces)
 
 
 def _lens(camera: Any) -> dict[str, Any]:

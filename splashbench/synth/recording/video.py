@@ -68,6 +68,9 @@ def write_recording(
         # One thread: the encoder's result then does not depend on the machine's number of cores.
         video.codec_context.options = {"crf": str(QUALITY), "preset": "veryfast", "threads": "1"}
         video.codec_context.gop_size = GROUP_OF_PICTURES
+        # BT.709 (libav's number 1) and television's range are stated: what is not, is decoded as BT.601, with a cast.
+        video.codec_context.color_primaries = video.codec_context.color_trc = video.codec_context.colorspace = 1
+        video.codec_context.color_range = 1
         audio = container.add_stream("aac", rate=SAMPLE_RATE)
         audio.codec_context.layout = "stereo"
         audio.codec_context.bit_rate = AUDIO_BITS_PER_SECOND

@@ -20,6 +20,10 @@ from splashbench.cli.main import main
 Fails = Callable[..., str]
 
 
+#: A pose as libraries for the web write it, column by column.
+TRANSPOSED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.2, 0.1, 0.5, 1]]
+
+
 def edit(path: Path, change: Callable[[dict], object]) -> None:
     data = json.loads(path.read_text())
     change(data)
@@ -58,6 +62,7 @@ def giant_png(path: Path, side: int) -> None:
         ("scene.json", lambda p: edit(p, lambda d: d.update(metres_per_unit=1e-10)), "metres_per_unit"),
         ("scene.json", lambda p: edit(p, lambda d: d.update(metres_per_unit=1e10)), "metres_per_unit"),
         ("scene.json", lambda p: edit(p, lambda d: d.update(container_pose=[[1], [1, 2]])), "must be 4x4"),
+        ("scene.json", lambda p: edit(p, lambda d: d.update(container_pose=TRANSPOSED)), "it may be transposed"),
         ("scene.json", lambda p: edit(p, lambda d: d["sizes"].update({"1": [65536, 65536]})), "sizes: camera 1"),
         ("scene.json", lambda p: edit(p, lambda d: d["sizes"].update({"one": [96, 64]})), "names camera one"),
         ("init_pt_cld.npz", lambda p: np.savez(p, data=np.array([[object()]])), "without pickles"),

@@ -201,6 +201,15 @@ def test_all_budgets_together_take_the_coarsest_of_their_grids(balls: Scene, tmp
     assert stored_bytes(fitted, tmp_path / "fitted") <= 1.05 * limit
 
 
+@pytest.mark.parametrize("settings", [{}, {"storage_tolerance": 0.0}])
+def test_bytes_are_kept_where_seconds_leave_the_draft_alone(balls: Scene, tmp_path: Path, settings: dict) -> None:
+    """How much values matter is measured in the last part of a fit, which may not come."""
+    limit = 80_000
+    fitted, run = fit(balls, Budget(seconds=1, storage_bytes=limit), **settings)
+    assert "grids for the seconds" in {decision.name for decision in run.decisions}
+    assert stored_bytes(fitted, tmp_path / "fitted") <= 1.05 * limit
+
+
 def test_a_budget_of_memory_is_the_processors(balls: Scene) -> None:
     run = Run(device="cuda", budget=Budget(memory_bytes=10**12))
     with pytest.raises(SplashbenchError, match="a budget of memory on the processor alone; give --device cpu"):

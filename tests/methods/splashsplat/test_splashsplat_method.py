@@ -241,6 +241,23 @@ def test_the_silhouette_term_averages_over_image_window_or_mask(balls: Scene):
         assert part.camera.width * part.camera.height < whole.area
 
 
+def test_photographs_of_before_the_first_and_after_the_last_timestep_teach_nothing(balls: Scene):
+    liquid = liquid_only(balls)
+    training = balls.training()
+    grey = {name: np.full((c.height, c.width, 3), 0.5, np.float32) for name, c in training.cameras.items()}
+
+    def count(late: float) -> int:
+        step = float(np.diff(balls.times).mean())
+        training.camera_times = {**balls.camera_times, "1": balls.times + late * step}
+        targets = collect_targets(training, grey, liquid.track, "window", camera_times=True)
+        return sum(target.camera.name == "1" for target in targets)
+
+    assert count(0.4) == count(0.0)
+    assert count(2.0) == count(-2.0) == count(0.0) - 2
+    training.camera_times = {**balls.camera_times, "1": balls.times + 1.0}
+    assert len(collect_targets(training, grey, liquid.track, "window")) == 5 * balls.n_frames
+
+
 # Figures are within the masks, where the background hardly counts; it would take most of the time.
 @pytest.mark.usefixtures("short_background")
 def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(tmp_path: Path):

@@ -245,7 +245,7 @@ def test_frames_that_no_grid_has_are_refused(
     header = json.loads((tmp_path / "liquid.json").read_text())
     header["grid"]["shape"] = shape
     (tmp_path / "liquid.json").write_text(json.dumps(header))
-    with pytest.raises(SplashbenchError, match=r"distance\.npz does not fit"):
+    with pytest.raises(SplashbenchError, match=r"distance\.npz does not fit|less than two nodes along an axis"):
         Liquid.load(tmp_path)
 
 
@@ -386,8 +386,13 @@ def test_steps_that_no_file_has_are_refused(
         lambda header: header.update(times=[]),
         lambda header: header["grid"].update(voxel=float("nan")),
         lambda header: header["grid"].update(voxel=-1.0),
+        lambda header: header["grid"].update(shape=[1, *header["grid"]["shape"][1:]]),
         lambda header: header["grid"].update(origin=[0.0, float("inf"), 0.0]),
         lambda header: header["decoder"].update(opacity_slope=float("nan")),
+        lambda header: header.update(factor=[2.0, float("nan"), 2.0]),
+        lambda header: header.update(factor=[float("inf")] * 3),
+        lambda header: header.update(factor=[2.0, 2.0, 0.0]),
+        lambda header: header.update(factor=0),
     ],
 )
 def test_numbers_that_no_model_has_are_refused(

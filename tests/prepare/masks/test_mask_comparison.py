@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from splashbench.prepare.masks.comparison import (
     mask_change,
     worst_pairs,
 )
-from splashbench.prepare.masks.comparison_report import write_report
+from splashbench.prepare.masks.comparison_report import change_table, pair_table, write_report
 from splashbench.prepare.masks.drawing import ADDED, OUTLINE, REMOVED, changed, outlined
 from splashbench.prepare.masks.sheet import (
     EMPTY,
@@ -251,3 +252,33 @@ def test_a_folder_needs_no_calibration_and_takes_images(folders: tuple[Path, Pat
     write_png(tmp_path / "frames" / "1" / "000000.png", np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(SplashbenchError, match=r"000000\.png is 4x4, its mask 50x20"):
         sheet_of_set(masks, columns=5, images=tmp_path / "frames")
+
+
+def test_a_sheet_has_room_for_so_many_pictures(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splashbench.prepare.masks.sheet._MAX_CELLS", 1)
+    (only,) = find_mask_sets(folders[0])[:1]
+    with pytest.raises(SplashbenchError, match=r"are more than the 1 pictures that a sheet has room for"):
+        sheet_of_set(only)
+
+
+def test_photographs_of_neurofluids_layout_are_no_masks(tmp_path: Path) -> None:
+    view = tmp_path / "WaterSphere" / "view_0"
+    (view / "train").mkdir(parents=True)
+    write_png(view / "train" / "r_000.png", np.zeros((4, 4, 3), np.uint8))
+    (view / "transforms_train.json").write_text("{}")
+    for place in (view.parent, view, view / "train"):
+        with pytest.raises(SplashbenchError, match="is of a scene in NeuroFluid's layout"):
+            find_mask_sets(place)
+
+
+def test_names_of_strangers_are_no_formulas(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    for folder, name in zip(folders, ("a", "b")):
+        shutil.copytree(folder, tmp_path / name)
+        for camera in list((tmp_path / name).rglob("*")):
+            if camera.is_dir() and any(camera.glob("*.png")):
+                camera.rename(camera.with_name(f"=SUM({camera.name})"))
+    (comparison,) = list(compare_folders(tmp_path / "a", tmp_path / "b"))[:1]
+    assert ",'=SUM(" in pair_table([comparison])
+    assert ",=SUM(" not in pair_table([comparison]) + change_table(change_rows([comparison]))

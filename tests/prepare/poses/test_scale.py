@@ -16,7 +16,7 @@ from splashbench.prepare.calibration.board import BoardDetector, BoardView
 from splashbench.prepare.calibration.lens import Lens
 from splashbench.prepare.calibration.marker import MarkerDetector
 from splashbench.prepare.poses import rig
-from splashbench.prepare.poses.metric import MetricFrame, Print, Sighting, agreeing, align_print
+from splashbench.prepare.poses.metric import MetricFrame, Print, Sighting, agreeing, align_print, is_seen_twice
 from splashbench.prepare.poses.scale import SceneFrame, Upright, choose_frame, distance_scale, rescaled, scene_frame
 from splashbench.prepare.poses.structure_from_motion import Poses
 from splashbench.prepare.session_tables import Board, Distance, Marker
@@ -257,6 +257,27 @@ def test_the_scale_sigma_of_a_print_is_the_scatter_of_its_scale() -> None:
         sigmas.append(frame.scale_sigma)
     assert np.mean(scales) == pytest.approx(1, abs=2e-4)
     assert np.std(scales) == pytest.approx(np.mean(sigmas), rel=0.25)
+
+
+def test_corners_of_one_line_do_not_say_how_the_board_lies() -> None:
+    """Seven are more than enough, but they leave open how it is turned about their line."""
+    detector = BoardDetector(BOARD)
+    flat = Print.of_board(detector)
+    world = flat.scene_points(range(len(flat.corners)))
+    row = flat.corners[:, 1]
+    first, second = (np.unique(row)[:2], np.unique(row)[1:3])  # what each camera sees; the second row is common
+
+    def sighting(camera: str, ids: np.ndarray) -> Sighting:
+        local = world[ids] @ TRUE[camera][:3, :3].T + TRUE[camera][:3, 3]
+        return Sighting(BoardView(ids, flat.corners[ids], LENS.project(local)), LENS, found().w2c[camera])
+
+    sightings = [sighting(c, np.flatnonzero(np.isin(row, rows))) for c, rows in (("1", first), ("2", second))]
+    assert not is_seen_twice(sightings, flat)
+    with pytest.raises(SplashbenchError, match=r"7 corners of the board are seen twice, all on one line, 6 are needed"):
+        align_print(sightings, flat)
+    whole = [sighting(camera, np.arange(len(world))) for camera in "12"]
+    assert is_seen_twice(whole, flat)
+    assert align_print(whole, flat).n_corners == len(world)
 
 
 def test_a_frame_needs_a_direction() -> None:

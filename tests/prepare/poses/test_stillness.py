@@ -79,7 +79,7 @@ def test_another_place_is_not_taken_for_this_one(filming: Filming) -> None:
     elsewhere = Filming(3)
     shift = background_shift(filming.static("1"), elsewhere.pour("1"))
     assert shift.px is None
-    gates = stillness_gates(seen(shift), SIZE[0])
+    gates = stillness_gates(seen(shift), widths(SIZE[0]))
     with pytest.raises(SplashbenchError, match="the pour of camera 1 shows another place than its static clip"):
         require(gates, "session")
 
@@ -125,6 +125,10 @@ def seen(*shifts: Shift) -> dict[str, Stillness]:
     return {str(k + 1): dict.fromkeys(INSTANTS, shift) for k, shift in enumerate(shifts)}
 
 
+def widths(px: int) -> dict[str, int]:
+    return {"1": px, "2": px}
+
+
 def failed(gates: list[Gate]) -> list[Gate]:
     assert all(gate.essential for gate in gates)
     return [gate for gate in gates if not gate.passed]
@@ -132,21 +136,26 @@ def failed(gates: list[Gate]) -> list[Gate]:
 
 def test_gates_say_which_camera_moved_and_when() -> None:
     still, moved = Shift(0.1, 100, 120), Shift(2.0, 90, 120)
-    assert failed(stillness_gates(seen(still, still), 480)) == []
-    (gate,) = failed(stillness_gates(seen(still, moved), 480))
+    assert failed(stillness_gates(seen(still, still), widths(480))) == []
+    (gate,) = failed(stillness_gates(seen(still, moved), widths(480)))
     assert gate.name == "camera_shift"
     assert "camera 2: start 2.00, middle 2.00, end 2.00" in gate.detail
     assert "camera 2 moved between its static clip and the pour" in gate.remedy
     during = seen(still, still)
     during["1"] = during["1"] | {"end": moved}
-    (gate,) = failed(stillness_gates(during, 480))
+    (gate,) = failed(stillness_gates(during, widths(480)))
     assert "camera 1 moved during the pour: fasten it" in gate.remedy
     # Somebody stands before camera 2 in the middle of the pour: this is the same place, and it is said.
     hidden = seen(still, still)
     hidden["2"] = hidden["2"] | {"middle": Shift(None, 3, 9)}
-    gates = stillness_gates(hidden, 480)
+    gates = stillness_gates(hidden, widths(480))
     (gate,) = [gate for gate in gates if not gate.passed]
     assert (gate.name, gate.essential) == ("shift_unmeasured", False)
     assert "camera 2 at the middle" in gate.detail
-    # The limit grows with the picture: 2 px of 4K are a sixth of what they are at 480 px.
-    assert failed(stillness_gates(seen(still, replace(moved, px=1.9)), 3840)) == []
+    # The limit grows with each camera's own picture: 2 px of 4K are an eighth of what they are at 480 px.
+    assert failed(stillness_gates(seen(still, replace(moved, px=1.9)), widths(3840))) == []
+    (gate,) = failed(stillness_gates(seen(replace(moved, px=1.9), replace(moved, px=1.5)), {"1": 3840, "2": 1920}))
+    assert (gate.value, gate.limit) == (1.5, 0.96)
+    assert "camera 2 moved" in gate.remedy
+    assert "camera 1" not in gate.remedy
+    assert failed(stillness_gates(seen(replace(moved, px=0.4), replace(moved, px=1.9)), {"1": 480, "2": 3840})) == []

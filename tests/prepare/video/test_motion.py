@@ -174,3 +174,12 @@ def test_through_a_real_file(tmp_path: Path) -> None:
     span, notes = camera_motion(Recording([path]))
     assert span == (pytest.approx(1.5, abs=0.1), pytest.approx(3.0, abs=0.15))
     assert notes == []
+
+
+def test_a_beginning_that_does_not_decode_is_one_line() -> None:
+    class Cut(Scene):
+        def luma(self, *among: object, **how: object) -> Iterator[tuple[int, np.ndarray]]:
+            return iter(())
+
+    with pytest.raises(SplashbenchError, match=r"view\.MP4: no frame of the first 0\.5 s can be decoded"):
+        camera_motion(Cut())  # type: ignore[arg-type]
