@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from splashbench.report.anytime import before, trajectories
+from splashbench.report import anytime
 from splashbench.report.groups import groups
 from splashbench.report.results import load_results
 
@@ -190,8 +190,8 @@ def test_scenes_over_time_are_those_of_the_committed_results() -> None:
     made = runpy.run_path(str(ROOT / "docs" / "tools" / "quality_over_time.py"))
     results = load_results(ROOT / "leaderboards" / "told_nothing" / "results")
     (group,) = groups(results)
-    nothing, entries = before(group, "psnr"), made["entries_of"](group)
-    runs = {name: trajectories(group, entry, "psnr") for name, entry in entries.items()}
+    nothing, entries = anytime.before(group, "psnr"), made["entries_of"](group)
+    runs = {name: anytime.trajectories(group, entry, "psnr") for name, entry in entries.items()}
     digests = {each.result.scene.removeprefix("synthetic_"): each.result.digests.scene for each in results}
 
     def shown(method: str, scene: str, seconds: float) -> float:
