@@ -22,7 +22,7 @@ _EPILOG = """\
 example:
   splashbench demo demo_output
 
-Takes six to seven minutes on two shared cores. Read demo_output/README.txt afterwards.
+Takes about six minutes on two shared cores. Read demo_output/README.txt afterwards.
 """
 
 #: Marks the folder of a demo, finished or not.
