@@ -26,7 +26,7 @@ _LONGER, _EXPONENT = 1.35, 2.15
 _BEFORE = 0.4
 # Below so many seconds there is the draft's background, below so many `quick`'s.
 _DRAFT_BACKGROUND, _QUICK_BACKGROUND = 45.0, 120.0
-# Seconds from which self-calibration is no large part of a fit: it takes 2 to 5 at 240x160, and 36 to 49 at 1200x1800.
+# Seconds from which self-calibration is no large part of a fit: it takes 2 to 5 at 240x160, and 23 to 49 at 1200x1800.
 _SELF_CALIBRATION, _SELF_CALIBRATION_MEGAPIXEL = 30.0, 125.0
 # Bytes of a background anchor as it is stored, and the share of a byte budget for all of them.
 _ANCHOR_BYTES, _BACKGROUND_SHARE = 52, 0.25

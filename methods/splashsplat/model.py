@@ -265,7 +265,7 @@ class Liquid:
                 raise ValueError(f"the decoder's sizes are not between 1 and {_WIDEST}")
             decoder = Decoder(settings)
             precision = Precision.stored(header["steps"]) if header["format"] in (FORMAT, UNCODED) else HIGHEST
-        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError, RuntimeError) as error:
             raise SplashbenchError(f"{path} is not a SplashSplat model ({error}); {AGAIN}") from None
         if header["format"] in EARLIER:
             track, look = fitting(directory, lambda: read_earlier(directory, header, grid, times, factor, decoder))

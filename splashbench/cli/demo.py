@@ -10,6 +10,7 @@ import argparse
 import shlex
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -60,12 +61,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     start = time.monotonic()
     out: Path = arguments.out
-    _claim(out, arguments.seed, arguments.fresh)
     seed = ["--seed", str(arguments.seed)]
     session, scene, truth, results = out / "session", out / "scene", out / "verify.json", out / "results"
-    sheet, runs = out / "contact_sheet.png", {name: out / "submissions" / name for name, _ in _RUNS}
+    sheet, leaderboard = out / "contact_sheet.png", out / "leaderboard"
+    video, summary = out / "splashsplat.mp4", out / "README.txt"
+    runs = {name: out / "submissions" / name for name, _ in _RUNS}
 
-    steps = _Steps(arguments.fresh)
+    # The contact sheet is what scoring writes last: where it is, the results are whole.
+    steps = _Steps([session, scene, truth, *runs.values(), sheet, results, leaderboard, video, summary])
+    _claim(out, arguments.seed, steps if arguments.fresh else None)
     steps.run("film a synthetic pour", session, ["synth", "session", str(session), *seed])
     steps.run("prepare the scene", scene, ["prepare", str(session), str(scene)])
     steps.run("compare it with the truth", truth, ["synth", "verify", str(session), str(scene), "--out", str(truth)])
@@ -74,7 +78,6 @@ def run(arguments: argparse.Namespace) -> int:
         steps.run(f"run {name}", runs[name], ["run", name, str(scene), str(runs[name]), *options])
     for name, directory in runs.items():
         steps.always(f"check {name}", ["check", str(directory), "--scene", str(scene)])
-    # The contact sheet is what scoring writes last: where it is, the results are whole.
     steps.run(
         "score them",
         sheet,
@@ -82,10 +85,9 @@ def run(arguments: argparse.Namespace) -> int:
             *("score", *map(str, runs.values()), "--scene", str(scene), "--out", str(results)),
             *("--reference", str(runs["nothing"]), "--sheet", str(sheet)),
         ],
-        stale=(results,),
     )
-    steps.always("draw the leaderboard", ["leaderboard", str(results), str(out / "leaderboard")])
-    video, shown = out / "splashsplat.mp4", str(runs["splashsplat"])
+    steps.always("draw the leaderboard", ["leaderboard", str(results), str(leaderboard)])
+    shown = str(runs["splashsplat"])
     steps.run(
         "show splashsplat beside the truth at half speed",
         video,
@@ -94,16 +96,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     gates = _gates(truth, results)
     text = _summary(out, gates, time.monotonic() - start)
-    write_text(out / "README.txt", text)
+    write_text(summary, text)
     say(f"\n{text}")
     if arguments.json:
         emit({"out": str(out), "passed": all(gate.passed for gate in gates), "gates": [vars(gate) for gate in gates]})
     return 0 if all(gate.passed for gate in gates) else 1
 
 
-def _claim(out: Path, seed: int, fresh: bool) -> None:
+def _claim(out: Path, seed: int, fresh: _Steps | None) -> None:
     """Mark `out` as the demo's own: it removes outputs that it makes again, so it must never take another folder.
 
+    fresh: steps whose outputs are removed before the mark names this demo, so that it speaks of all that lies there.
     Raises SplashbenchError for a folder of something else, and without `fresh` for a demo of another seed or version:
     its outputs would be skipped, and their figures shown as those of this one.
     """
@@ -114,8 +117,8 @@ def _claim(out: Path, seed: int, fresh: bool) -> None:
     mark = out / _MARK
     if out.is_dir() and any(out.iterdir()) and not mark.is_file():
         raise SplashbenchError(f"{out} holds files that are not the demo's; give a new or an empty folder")
-    text = f"Made by `splashbench demo`, which may replace everything here.\n{_made_by(seed)}\n"
-    if mark.is_file() and not fresh:
+    text = "Made by `splashbench demo`, which may replace everything here.\n"
+    if mark.is_file() and fresh is None:
         made_by = read_plain(mark, _MARK_BYTES).decode("utf-8", "replace").partition("\n")[2].strip()
         if made_by != _made_by(seed):
             was = made_by or "an earlier version"
@@ -123,7 +126,10 @@ def _claim(out: Path, seed: int, fresh: bool) -> None:
                 f"{out} holds the demo of {one_line(was)}, and this is {_made_by(seed)}; add --fresh to make all of it "
                 "again, or give another folder"
             )
-    write_text(mark, text)
+    if fresh is not None and mark.is_file():
+        write_text(mark, text + "a run that was stopped while it removed outputs\n")
+        fresh.forget(0)
+    write_text(mark, f"{text}{_made_by(seed)}\n")
 
 
 def _made_by(seed: int) -> str:
@@ -134,28 +140,32 @@ def _made_by(seed: int) -> str:
 
 
 class _Steps:
-    """Runs commands in order. Once one has run, every later one runs too: its input has changed."""
+    """Runs commands in order. outputs: what they make, in this order; later ones are made from earlier ones."""
 
-    def __init__(self, fresh: bool) -> None:
-        self._fresh = fresh
+    def __init__(self, outputs: Sequence[Path]) -> None:
+        self._outputs = outputs
         self._count = 0
 
-    def run(self, title: str, output: Path, command: list[str], stale: tuple[Path, ...] = ()) -> None:
-        """Run `command` unless its `output` exists and no earlier step has run.
+    def run(self, title: str, output: Path, command: list[str]) -> None:
+        """Run `command` unless its `output` exists.
 
-        `output` and `stale` are removed first: they are the demo's own, from an earlier run.
+        All later outputs are removed first: were the demo stopped, they would be taken for what it makes next time.
         """
-        if output.exists() and not self._fresh:
+        if output.exists():
             self._count += 1
             say(f"\n[{self._count}] {title}: skipped, {output} exists")
             return
-        self._fresh = True
-        for path in (output, *stale):
-            if path.is_dir():
+        self.forget(self._outputs.index(output))
+        self.always(title, command)
+
+    def forget(self, first: int) -> None:
+        """Remove the outputs from number `first` on: they are the demo's own, from an earlier run."""
+        for path in self._outputs[first:]:
+            # Loudly: what could not be removed would be skipped as if it had been made again.
+            if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
-        self.always(title, command)
 
     def always(self, title: str, command: list[str]) -> None:
         """Run `command`; its failure ends the demo."""

@@ -22,13 +22,14 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MAX_MARKER_BYTES = 16_000_000
 # Beside an output, or within its folder, where the name ends here and a place in it follows.
 _STAGED = re.compile(r"\.tmp-[0-9a-f]{8}-/?")
-#: As the name of an output: whatever is written into its folder.
-_WITHIN = "*"
+
+
+def _staging_name() -> str:
+    return f".tmp-{uuid.uuid4().hex[:8]}-"
 
 
 def _sibling(path: Path) -> Path:
-    name = "" if path.name == _WITHIN else path.name
-    return path.with_name(f".tmp-{uuid.uuid4().hex[:8]}-{name}")
+    return path.with_name(_staging_name() + path.name)
 
 
 def is_staged_for(path: Path, output: Path) -> bool:
@@ -195,7 +196,7 @@ def files_together(directory: Path) -> Iterator[Path]:
     require_folder_place(directory)
     directory.parent.mkdir(parents=True, exist_ok=True)
     # Within it where that can be: the folder above may be another disk's, or be nobody's to write into.
-    staging = _sibling(directory / _WITHIN if directory.is_dir() else directory)
+    staging = directory / _staging_name() if directory.is_dir() else _sibling(directory)
     try:
         staging.mkdir()
         yield staging

@@ -11,7 +11,7 @@ import numpy as np
 
 #: Bytes that photographs and masks of one scene may take; of a scene that has more no photographs are kept.
 MAX_KEPT_BYTES = 64 << 20
-#: Bytes that the masks of such a scene may take, packed: a hundredth of a byte for each pixel is plenty.
+#: Bytes that the masks of such a scene may take, packed; what is beyond is read again.
 MAX_PACKED_BYTES = 64 << 20
 
 Pixels = TypeVar("Pixels", bound=np.ndarray[Any, Any])

@@ -46,10 +46,9 @@ _MUCH_CLEARER = 1.3
 _LEAST_CAMERAS = 3
 # Offsets below are no offsets, in timesteps.
 _SAME = 0.03
-# Of one mask, the droplets that are looked at at most, the largest of all; triples of them in three frames, and flights
-# through one frame, those first that are mistaken for the fewest others. Votes take the square of flights, and these
-# the cube of droplets.
-_MOST_DROPLETS, _MOST_TRIPLES, _MOST_FLIGHTS = 80, 4_000_000, 400
+# Of one mask, the largest droplets that are looked at at most; and flights through one frame of a view, those first
+# that are mistaken for the fewest others. Flights take the cube of droplets, and votes the square of flights.
+_MOST_DROPLETS, _MOST_FLIGHTS = 80, 400
 # Part of a timestep within which two views' flights meet, or are none of each other.
 _NEAR = 0.52
 
@@ -180,8 +179,6 @@ def _flights(
         if not (len(before) and len(now) and len(after)):
             continue
         first, second = np.nonzero(_flown(before, now, scale))
-        if len(first) * len(after) > _MOST_TRIPLES:
-            continue
         bend = after[None] - (2 * now[second] - before[first])[:, None]
         fallen = np.clip(bend @ fall / length, -0.5 * scale, most * scale)
         astray = np.linalg.norm(bend - fallen[..., None] * fall / length, axis=-1)

@@ -34,30 +34,28 @@ def parser(monkeypatch: pytest.MonkeyPatch) -> _Parser:
 def test_what_exists_is_skipped_until_a_step_runs(
     tmp_path: Path, parser: _Parser, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first, second, third, stale = (tmp_path / name for name in ("1", "2", "3", "stale"))
+    first, second, third, results = outputs = [tmp_path / name for name in ("1", "2", "3", "results")]
     for path in (first, third):
         path.write_text("before")
-    stale.mkdir()
-    steps = demo._Steps(fresh=False)
+    results.mkdir()
+    steps = demo._Steps(outputs)
     steps.run("film", first, ["film", str(first)])
     steps.run("prepare", second, ["prepare", str(second)])
-    steps.run("score", third, ["score", str(third)], stale=(stale,))
+    steps.run("score", third, ["score", str(third)])
     assert [words[0] for words in parser.commands] == ["prepare", "score"]
     assert [path.read_text() for path in (first, second, third)] == ["before", "output", "output"]
-    assert not stale.exists()
+    assert not results.exists()
     assert f"[1] film: skipped, {first} exists" in capsys.readouterr().err
 
 
-def test_fresh_repeats_every_step(tmp_path: Path, parser: _Parser) -> None:
-    (tmp_path / "1").write_text("before")
-    demo._Steps(fresh=True).run("film", tmp_path / "1", ["film", str(tmp_path / "1")])
-    assert [words[0] for words in parser.commands] == ["film"]
-
-
-def test_a_step_that_fails_ends_the_demo(tmp_path: Path, parser: _Parser) -> None:
+def test_a_step_that_fails_ends_the_demo_and_leaves_nothing_that_was_made_from_its_output(
+    tmp_path: Path, parser: _Parser
+) -> None:
     parser.status = 1
+    (tmp_path / "2").write_text("made from another 1")
     with pytest.raises(SplashbenchError, match=r"the demo stopped at: splashbench film .*; see the lines above"):
-        demo._Steps(fresh=False).run("film", tmp_path / "1", ["film", str(tmp_path / "1")])
+        demo._Steps([tmp_path / "1", tmp_path / "2"]).run("film", tmp_path / "1", ["film", str(tmp_path / "1")])
+    assert not (tmp_path / "2").exists()
 
 
 @pytest.mark.parametrize(
@@ -75,24 +73,44 @@ def test_a_gate_passes_on_its_side_of_the_limit(value: float | None, at_most: bo
 
 
 def test_a_folder_becomes_the_demos_only_where_it_is_empty(tmp_path: Path) -> None:
-    demo._claim(tmp_path / "out", 0, fresh=False)
-    demo._claim(tmp_path / "out", 0, fresh=False)
+    demo._claim(tmp_path / "out", 0, None)
+    demo._claim(tmp_path / "out", 0, None)
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "holiday.jpg").write_bytes(b"dear")
+    (tmp_path / "photos" / "scene").write_bytes(b"dear")
     with pytest.raises(SplashbenchError, match="holds files that are not the demo's"):
-        demo._claim(tmp_path / "photos", 0, fresh=True)
+        demo._claim(tmp_path / "photos", 0, demo._Steps([tmp_path / "photos" / "scene"]))
+    assert (tmp_path / "photos" / "scene").read_bytes() == b"dear"
 
 
 def test_outputs_of_another_seed_or_version_are_not_shown_as_those_of_this_one(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    demo._claim(out, 0, fresh=False)
+    demo._claim(out, 0, None)
+    (out / "scene").mkdir()
     with pytest.raises(SplashbenchError, match=r"holds the demo of seed 0, .*, and this is seed 1, .* add --fresh"):
-        demo._claim(out, 1, fresh=False)
-    demo._claim(out, 1, fresh=True)
-    demo._claim(out, 1, fresh=False)
+        demo._claim(out, 1, None)
+    demo._claim(out, 1, demo._Steps([out / "scene"]))
+    assert not (out / "scene").exists()
+    demo._claim(out, 1, None)
     (out / demo._MARK).write_text("Made by `splashbench demo`, which may replace everything here.\n")
     with pytest.raises(SplashbenchError, match="holds the demo of an earlier version"):
-        demo._claim(out, 1, fresh=False)
+        demo._claim(out, 1, None)
+
+
+def test_fresh_that_was_stopped_leaves_nothing_that_is_shown_as_this_demos(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    demo._claim(out, 0, None)
+
+    class Stopped(demo._Steps):
+        def forget(self, first: int) -> None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        demo._claim(out, 1, Stopped([]))
+    for seed in (0, 1):
+        with pytest.raises(SplashbenchError, match=r"a run that was stopped while it removed outputs, .* add --fresh"):
+            demo._claim(out, seed, None)
+    demo._claim(out, 1, demo._Steps([]))
+    demo._claim(out, 1, None)
 
 
 def test_the_demo_ends_with_a_video_and_all_its_commands_exist(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from pydantic import TypeAdapter
 from splashbench.alignment import Similarity
 from splashbench.cli import prepare as cli_prepare
 from splashbench.errors import SplashbenchError
+from splashbench.prepare import stage_cache
 from splashbench.prepare.audio.clocks import SyncResult
 from splashbench.prepare.audio.sync import ClockFit, SequenceSync
 from splashbench.prepare.calibration.board import BoardView
@@ -296,3 +298,16 @@ def test_killed_at_any_moment_the_outcome_is_the_same(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.communicate()
         assert start(tmp_path / f"killed{number}").communicate()[0] == undisturbed
+
+
+def test_results_depend_on_the_code_of_every_room_that_makes_them() -> None:
+    """`prepare`, the rooms that it imports, and those that these import."""
+    package = Path(stage_cache.__file__).parents[1]
+    found, waiting = set[str](), ["prepare"]
+    while waiting:
+        room = waiting.pop()
+        found.add(room)
+        text = "\n".join(path.read_text(encoding="utf-8") for path in (package / room).rglob("*.py"))
+        named = set(re.findall(r"from splashbench\.(\w+)", text))
+        waiting += [name for name in named - found if (package / name).is_dir()]
+    assert set(stage_cache._ROOMS) == found

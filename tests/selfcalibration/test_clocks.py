@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splashbench.scene import Camera, Scene
+from splashbench.selfcalibration import clocks
 from splashbench.selfcalibration.clocks import Offset, clock_offsets, droplets_of
 from splashbench.selfcalibration.stance import find_knock
 
@@ -103,6 +104,22 @@ def test_droplets_are_small_and_whole_and_fly(cameras: Cameras) -> None:
         masks[t, 40 + 4 * t : 43 + 4 * t, 120:123] = True
     found = droplets_of(masks, cameras["1"])
     assert [drops.tolist() for drops in found] == [[[121.5, 41.5 + 4 * t]] for t in range(8)]
+
+
+def test_of_many_droplets_the_largest_have_a_say_and_flights_are_bounded(cameras: Cameras) -> None:
+    """Votes would take hours and gigabytes: they grow with the sixth power of the droplets' number."""
+    masks = np.zeros((3, 160, 240), bool)
+    grid = [(row, column) for row in range(4, 144, 12) for column in range(4, 232, 12)]
+    places = np.random.default_rng(0).permutation(grid)[:200]
+    for t, mask in enumerate(masks):
+        for number, (row, column) in enumerate(places):
+            side = 3 if number < 80 else 2
+            mask[row + 4 * t : row + 4 * t + side, column : column + side] = True
+    found = droplets_of(masks, cameras["1"])
+    assert [len(drops) for drops in found] == [80, 80, 80]
+    assert {float(middle[0]) % 1 for middle in found[0]} == {0.5}  # of three pixels, not of two
+    flights = clocks._flights(found, cameras["1"], DOWN, 12.0, 1.0)
+    assert len(flights.frame) == len(flights.places) == len(flights.alike) == clocks._MOST_FLIGHTS
 
 
 def views(frames: list[NDArray[np.uint8]], camera: Camera) -> Any:

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("embreex")
 
+from splashbench.synth.imaging import rendering
 from splashbench.synth.imaging.geometry import LOOK_AT, Mesh, Quad, arc_point, bowl_mesh, look_at, revolve
 from splashbench.synth.imaging.lens import LensCamera, distort, undistort
 from splashbench.synth.imaging.rendering import RoomView, TracedRoom
@@ -100,3 +101,24 @@ def test_the_container_mask_covers_the_bowl_and_nothing_else(view: RoomView, cam
     assert columns.max() + 1 == pytest.approx(uv[:, 0].max(), abs=1)
     assert rows.min() == pytest.approx(uv[:, 1].min(), abs=1)
     assert rows.max() + 1 == pytest.approx(uv[:, 1].max(), abs=1)
+
+
+def test_what_is_left_out_for_shadows_changes_no_pixel(view: RoomView, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what may lie in the liquid's shadow is asked whether it does."""
+    drops = [ball(np.array(place), 0.01) for place in ((-0.2, 0.15, 0.0), (0.0, 0.12, 0.05), (0.1, 0.3, 0.0))]
+    asked: list[float] = []
+    chosen = rendering._may_lie_in_shadow
+
+    def noted(*of: np.ndarray) -> np.ndarray:
+        found = chosen(*of)
+        asked.append(found.mean())
+        return found
+
+    monkeypatch.setattr(rendering, "_may_lie_in_shadow", noted)
+    few = [view.with_liquid(drop) for drop in drops]
+    assert 0 < max(asked) < 0.5
+    monkeypatch.setattr(rendering, "_may_lie_in_shadow", lambda vertices, points, light: np.ones(len(points), bool))
+    for frame, drop in zip(few, drops):
+        whole = view.with_liquid(drop)
+        np.testing.assert_array_equal(frame.image, whole.image)
+        np.testing.assert_array_equal(frame.mask, whole.mask)

@@ -104,8 +104,9 @@ def find_mask_sets(folder: Path) -> list[MaskSet]:
     folder = Path(folder)
     if not folder.is_dir():
         raise SplashbenchError(f"{folder} is not a folder; give a scene, or a folder of masks <camera>/<frame>.png")
-    # Photographs of a view lie as masks do elsewhere.
-    if is_neurofluid(folder) or any(any(place.glob("transforms_*.json")) for place in (folder, folder.parent)):
+    # Photographs of a view lie as masks do elsewhere; masks/ beside such a file is of an exported scene.
+    places = [folder] if folder.name == "masks" else [folder, folder.parent]
+    if is_neurofluid(folder) or any(any(place.glob("transforms_*.json")) for place in places):
         raise SplashbenchError(
             f"{folder} is of a scene in NeuroFluid's layout, which keeps its masks within its photographs; "
             "give a folder of masks <camera>/<frame>.png"

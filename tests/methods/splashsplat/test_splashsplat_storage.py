@@ -393,6 +393,8 @@ def test_steps_that_no_file_has_are_refused(
         lambda header: header.update(factor=[float("inf")] * 3),
         lambda header: header.update(factor=[2.0, 2.0, 0.0]),
         lambda header: header.update(factor=0),
+        lambda header: header.update(factor=float("inf")),
+        lambda header: header["grid"]["shape"].__setitem__(0, float("inf")),
     ],
 )
 def test_numbers_that_no_model_has_are_refused(

@@ -273,6 +273,12 @@ def test_photographs_of_neurofluids_layout_are_no_masks(tmp_path: Path) -> None:
             find_mask_sets(place)
 
 
+def test_masks_beside_the_cameras_of_an_exported_scene_are_masks(tmp_path: Path) -> None:
+    (tmp_path / "transforms_train.json").write_text("{}")
+    write_png(tmp_path / "masks" / "1" / "0000.png", np.zeros((4, 4), np.uint8))
+    assert [each.files["1"].keys() for each in find_mask_sets(tmp_path / "masks")] == [{"0000"}]
+
+
 def test_names_of_strangers_are_no_formulas(folders: tuple[Path, Path], tmp_path: Path) -> None:
     for folder, name in zip(folders, ("a", "b")):
         shutil.copytree(folder, tmp_path / name)
