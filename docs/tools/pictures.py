@@ -27,13 +27,16 @@ from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
 from splashbench.dyes import DYES
 from splashbench.errors import SplashbenchError
+from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames
 from splashbench.replay import load
 from splashbench.report.contact_sheet import contact_sheet
 from splashbench.restyle import filmed_dye, restyled
 from splashbench.scene import Scene
 from splashbench.scene.scene import TrainingScene
+from splashbench.selfcalibration.thickness import REACH, Thickness, agreement, courses
 from splashbench.selfcalibration.unmasked import outlines_by_change
 from splashbench.study.perturbations import KINDS, Dice, Recording, Step, perturbed
+from splashbench.study.perturbations.cameras import TightFraming
 from splashbench.study.perturbations.setup import MissingCameras
 from splashbench.study.perturbations.timesteps import FewerTimesteps
 from splashbench.study.scenes import recording_of
@@ -50,6 +53,7 @@ WORK = ROOT / "build" / "pictures"
 SCENE = WORK / "scene"
 POUR = ("synth", "scene", "opaque_bowl")
 METHODS = {"splashsplat": "SplashSplat (this project)", "scaffold_4d": "4D-Scaffold-GS (best baseline)"}
+SMALL = ("--size", "240x160", "--times-alone")
 VIEW, FRAME = "6", 8
 ORANGE, BLUE = "#E69F00", "#0072B2"
 
@@ -390,6 +394,81 @@ def rims() -> list[Path]:
     return [store(figure, "method_rim.png", 130)]
 
 
+def clocks() -> list[Path]:
+    """How thick the liquid is in the planes of two cameras over time, one of them on a clock that is off, and how well
+    that agrees at any offset."""
+    scene = Scene.open(made(WORK / "told_nothing_small", *POUR, str(WORK / "told_nothing_small"), *SMALL))
+    late, names = 5, (scene.train[0], scene.train[3])
+    frames = np.arange(late, scene.n_frames - late)
+    views = [
+        Thickness.of([scene.mask(name, int(t)) for t in frames + off], scene.cameras[name])
+        for name, off in zip(names, (0, late))
+    ]
+    seen = courses(*views)
+    assert seen is not None
+    lags = np.arange(-REACH, REACH + 1)
+    figure = Figure(figsize=(10, 2.6), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for axes, name, course, off in zip(panels, names, seen, ("", f", {late} timesteps late")):
+        axes.imshow(course.T, aspect="auto", cmap="magma", origin="lower")
+        axes.set_title(f"camera {name}{off}", fontsize=10)
+        axes.set_xlabel("timestep")
+        axes.set_yticks([])
+    panels[0].set_ylabel("planes through both cameras")
+    # Of what the second shows so much later, it is told to show that much too late.
+    panels[2].plot(lags, [agreement(*seen, -int(lag)) for lag in lags], color=BLUE, marker="o", markersize=3)
+    panels[2].axvline(late, color=ORANGE)
+    panels[2].set_xlabel("offset of the second clock, timesteps")
+    panels[2].set_title("agreement; the true offset (orange)", fontsize=10)
+    return [store(figure, "method_clocks.png", 120)]
+
+
+def cut_off() -> list[Path]:
+    """A view that frames its liquid too tightly, and hulls of another view's liquid with and without its say past its
+    sides."""
+    scene = Scene.open(made(WORK / "told_nothing_small", *POUR, str(WORK / "told_nothing_small"), *SMALL))
+    tight = perturbed(recording_of(scene, list(scene.train)), [TightFraming(amount=0.5)], Dice(0, scene.name))
+    (name,) = (name for name in tight.views if not np.array_equal(tight.cameras[name].K, scene.cameras[name].K))
+    frame, other = scene.n_frames * 3 // 5, scene.train[0] if name != scene.train[0] else scene.train[1]
+    camera = scene.cameras[other]
+    outlines = []
+    for has_a_say in (True, False):
+        silhouettes = Silhouettes(_Pictures(tight))
+        if has_a_say:
+            silhouettes.cut_off = [None] * len(silhouettes.views)
+        grid = Grid.over(sequence_bounds(silhouettes).padded(0.1), 160)
+        phi = next(signed_distance_frames(silhouettes, grid, frames=[frame]))
+        places, _ = camera.project(grid.to_scene(np.argwhere(phi < 0)))
+        column, row = np.floor(places).astype(int).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        hull = np.zeros((camera.height, camera.width), dtype=bool)
+        hull[row[inside], column[inside]] = True
+        outlines.append(ndimage.binary_closing(hull, iterations=2))
+    figure = Figure(figsize=(10, 2.5), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    bare(left, "a camera that frames too tightly").imshow(tight.image(name, frame))
+    left.contour(tight.mask(name, frame), levels=[0.5], colors=["white"], linewidths=1)
+    for axes, hull, title in (
+        (middle, outlines[0], "hull, if its sides end the liquid"),
+        (right, outlines[1], "hull, if it says nothing past them"),
+    ):
+        bare(axes, title).imshow(scene.image(other, frame))
+        axes.contour(hull, levels=[0.5], colors=[ORANGE], linewidths=1.2)
+    return [store(figure, "method_cut_off.png", 120)]
+
+
+class _Pictures:
+    """A `Recording` as carving needs it."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.name, self.cameras = "recording", recording.cameras
+        self.train, self.n_frames = tuple(recording.views), recording.n_frames
+        self._recording = recording
+
+    def mask(self, camera: str, t: int) -> NDArray[np.bool_]:
+        return self._recording.mask(camera, t)
+
+
 def lives(active: NDArray[np.bool_], times: NDArray[np.float64]) -> Path:
     """How many carriers of each frame were born there, and how many came from an earlier frame."""
     born = active & ~np.roll(active, 1, axis=0)
@@ -499,6 +578,8 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "standing": standing,
     "unmasked": unmasked,
     "rims": rims,
+    "clocks": clocks,
+    "cut_off": cut_off,
     "transmission": transmission,
     "perturbations": perturbations,
     "tutorial": tutorial,

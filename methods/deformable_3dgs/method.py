@@ -57,7 +57,7 @@ class Deformable3DGS(GaussianMethod):
 
     id: ClassVar[str] = "deformable_3dgs"
     title: ClassVar[str] = "Deformable-3DGS"
-    version: ClassVar[str] = "4"  # since the times' noise of `paper` is the official code's
+    version: ClassVar[str] = "5"  # since hulls, where it starts, go on past the sides of images
     Config: ClassVar[type[MethodConfig]] = DeformableSettings
     mixed: ClassVar[bool] = True
 

@@ -22,6 +22,7 @@ class HullPointsSettings(MethodConfig):
 class HullPoints(Method):
     id = "hull_points"
     title = "points of the visual hull, coloured from the training views"
+    version = "2"  # since hulls go on past the sides of images
     Config = HullPointsSettings
 
     def fit(self, scene: TrainingScene, config: HullPointsSettings, run: Run) -> Model:

@@ -38,7 +38,7 @@ class Scaffold4D(GaussianMethod):
 
     id: ClassVar[str] = "scaffold_4d"
     title: ClassVar[str] = "4D-Scaffold-GS"
-    version: ClassVar[str] = "3"  # since it starts and penalises volumes as published
+    version: ClassVar[str] = "4"  # since hulls, where it starts, go on past the sides of images
     torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = Scaffold4DSettings
     mixed: ClassVar[bool] = True

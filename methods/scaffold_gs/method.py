@@ -45,7 +45,7 @@ class ScaffoldGS(GaussianMethod):
 
     id: ClassVar[str] = "scaffold_gs"
     title: ClassVar[str] = "Scaffold-GS, static"
-    version: ClassVar[str] = "3"  # since anchors beside the view are left out
+    version: ClassVar[str] = "4"  # since hulls, where it starts, go on past the sides of images
     torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = BackgroundSettings
 

@@ -55,7 +55,7 @@ class SpacetimeGaussians(GaussianMethod):
 
     id: ClassVar[str] = "spacetime_gaussians"
     title: ClassVar[str] = "SpacetimeGaussians, full"
-    version: ClassVar[str] = "3"  # since `quick` starts with faint Gaussians, as published
+    version: ClassVar[str] = "4"  # since hulls, where it starts, go on past the sides of images
     torch_optim: ClassVar[bool] = False
     Config: ClassVar[type[MethodConfig]] = SpacetimeSettings
     mixed: ClassVar[bool] = True

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.observe.silhouettes import ImageWindow
+from splashbench.observe.image_window import ImageWindow
 from splashbench.parallel import each
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene

@@ -64,7 +64,7 @@ def missing_shares(silhouettes: Silhouettes, container: ContainerOcclusion | Non
     """
     grid = Grid.over(bounds, _CELLS)
     # What one view alone sees is as long as its rays: it would accuse the masks of all others.
-    carving = None if container is None else CarvingOcclusion(container, silhouettes, grid, witnesses=2)
+    carving = CarvingOcclusion.of(container, silhouettes, grid, witnesses=2)
     patches = [_Patches(camera, grid, carving, view) for view, camera in enumerate(silhouettes.cameras)]
     shape = (silhouettes.n_frames, len(silhouettes.views))
     covered = [np.zeros((silhouettes.n_frames, patch.count), dtype=bool) for patch in patches]

@@ -22,6 +22,10 @@ class Bounds:
     def longest_side(self) -> float:
         return float((self.high - self.low).max())
 
+    def joined(self, other: Bounds) -> Bounds:
+        """The smallest box that holds both."""
+        return Bounds(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
+
     def padded(self, fraction: float) -> Bounds:
         """The box grown so that each side is `1 + fraction` times as long."""
         margin = 0.5 * fraction * (self.high - self.low)

@@ -2,7 +2,8 @@
 
 phi(x) = max over views of s_v(pi_v(x)) z_v(x) / f_v, with s_v the 2-D signed distance in pixels to the view's
 silhouette: positive as soon as one view contradicts x, sub-voxel sharp, and without a 3-D distance transform.
-A container adds where its walls are, and which views see x at all (occlusion.py).
+A view does not contradict what is past a side of its image at which liquid is cut off, nor what a container hides from
+it; a container adds where its walls are (occlusion.py).
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import numpy as np
 
 from splashbench.errors import SplashbenchError
 from splashbench.observe.carving import BLOCK, blocks_of, carve_view
+from splashbench.observe.cut_off import in_images
 from splashbench.observe.grid import Bounds, Grid
+from splashbench.observe.image_window import ImageWindow
 from splashbench.observe.kernels import fill_blocks
 from splashbench.observe.occlusion import LIMIT_VOXELS, CarvingOcclusion, ContainerOcclusion, focal_length
-from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
+from splashbench.observe.silhouettes import MaskedScene, Silhouettes
 from splashbench.parallel import each
 
 SEARCH_CELLS = 64
@@ -28,15 +31,20 @@ _WORTH_BLOCKS = 48
 _HALF = 0.5 * (BLOCK - 1) * 3**0.5
 # By how much a distance read between pixels may miss what its slope of one allows, pixels.
 _BETWEEN_PIXELS = 0.6
+# Nodes so many voxels outside the hull, or less, may be at liquid.
+_NEAR = 0.5
+# Of liquid that some images cut off, this share at either end of each axis gets no grid.
+_FRINGE = 0.003
 
 #: the 2-D signed distance s_v of view number v, of a window of its image
 Distance = Callable[[int, ImageWindow | None], np.ndarray]
 
 
-def carve(
-    silhouettes: Silhouettes, grid: Grid, distance: Distance, container: CarvingOcclusion | None = None
-) -> np.ndarray:
-    """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v."""
+def carve(silhouettes: Silhouettes, grid: Grid, distance: Distance, container: CarvingOcclusion | None) -> np.ndarray:
+    """Hull distance on `grid`, float32 [nx, ny, nz] in voxels, negative inside; `distance` gives s_v.
+
+    container: `CarvingOcclusion.of` them.
+    """
     phi = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32) if container is None else container.outside.copy()
     carvers = each(lambda view: _Carver(silhouettes, view, distance, container), range(len(silhouettes.cameras)))
     blocks: list[np.ndarray] | list[None] = [None] * len(carvers)
@@ -63,14 +71,14 @@ def _blocks(grid: Grid, carvers: list[_Carver]) -> tuple[np.ndarray, list[np.nda
     return far, [~far & (high > least) for _, high in bounds]
 
 
-def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None = None) -> np.ndarray:
+def carve_frame(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None) -> np.ndarray:
     """Hull distance of frame `t` (see `carve`); LIMIT_VOXELS everywhere in a frame without liquid."""
     if not silhouettes.has_liquid(t):
         return np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
     return carve(silhouettes, grid, lambda view, window: silhouettes.distance(view, t, window), container)
 
 
-def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None = None) -> np.ndarray:
+def carve_views(silhouettes: Silhouettes, grid: Grid, t: int, container: CarvingOcclusion | None) -> np.ndarray:
     """What each view alone is certain of in frame `t`: float32 [V, nx, ny, nz] in voxels, < 0 in its silhouette."""
     views = np.full((len(silhouettes.cameras), *grid.shape), -LIMIT_VOXELS, dtype=np.float32)
     carvers = each(
@@ -90,12 +98,12 @@ class _Carver:
     def __init__(
         self, silhouettes: Silhouettes, view: int, distance: Distance, container: CarvingOcclusion | None
     ) -> None:
-        self._camera, self._corner = silhouettes.cameras[view], silhouettes.windows[view].corner
+        self._camera = silhouettes.cameras[view]
         self._occlusion = container.views[view] if container is not None and container.views else None
-        if self._occlusion is None:
-            self._evidence = distance(view, None)
-        else:
-            self._evidence = self._occlusion.evidence(distance(view, self._occlusion.window))
+        window = silhouettes.evidence_window(view) if self._occlusion is None else self._occlusion.window
+        self._corner, self._evidence = window.corner, distance(view, window)
+        if self._occlusion is not None:
+            self._evidence = self._occlusion.evidence(self._evidence)
 
     def carve(self, phi: np.ndarray, grid: Grid, blocks: np.ndarray | None = None) -> None:
         """phi = max(phi, that), in place, in voxels of `grid`, in `blocks` (see `carve_view`)."""
@@ -192,7 +200,7 @@ def sequence_bounds(
     # First what all frames together allow: no frame's liquid can lie outside it, and it costs one carving only.
     for _ in range(3):
         grid = Grid.over(bounds, SEARCH_CELLS)
-        carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
+        carving = CarvingOcclusion.of(container, silhouettes, grid)
         common = _inside(carve(silhouettes, grid, silhouettes.sequence_distance, carving), grid, tolerance=1.0)
         if common is None:
             where = "" if container is None else ", and that the container is at the liquid (container_pose, gravity)"
@@ -204,10 +212,32 @@ def sequence_bounds(
     if not tight:
         return bounds
     grid = Grid.over(bounds.padded(0.02), REFINED_CELLS)
-    carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
+    carving = CarvingOcclusion.of(container, silhouettes, grid)
     nearest = np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
+    frames = np.zeros(grid.shape, dtype=np.int16)
     for t in range(silhouettes.n_frames):
-        np.minimum(nearest, carve_frame(silhouettes, grid, t, carving), out=nearest)
+        phi = carve_frame(silhouettes, grid, t, carving)
+        np.minimum(nearest, phi, out=nearest)
+        frames += phi < _NEAR
     # Streams thinner than a voxel may fall between the nodes, hence the tolerance.
-    refined = _inside(nearest, grid, tolerance=0.5)
-    return bounds if refined is None else refined
+    refined = _inside(nearest, grid, tolerance=_NEAR)
+    if refined is None or not any(silhouettes.cut_off):
+        return bounds if refined is None else refined
+    # What not all images have is known less well. Single drops of it, and what only seems to be there, are not worth a
+    # coarser grid for all.
+    most = _without_fringe(frames, grid)
+    in_all = _inside(
+        np.maximum(nearest, -in_images(silhouettes.that_see_liquid, grid, 1.0, LIMIT_VOXELS)), grid, tolerance=_NEAR
+    )
+    return most if in_all is None else most.joined(in_all)
+
+
+def _without_fringe(frames: np.ndarray, grid: Grid) -> Bounds:
+    """Box around all but a share of `_FRINGE` of the liquid at either end of each axis, half a voxel larger on every
+    side. frames: in how many it is at each node."""
+    low, high = [], []
+    for axes in ((1, 2), (0, 2), (0, 1)):
+        summed = np.cumsum(frames.sum(axis=axes, dtype=np.int64))
+        low.append(np.searchsorted(summed, _FRINGE * summed[-1], side="right") - 0.5)
+        high.append(np.searchsorted(summed, (1 - _FRINGE) * summed[-1]) + 0.5)
+    return Bounds(grid.to_scene(np.array(low)), grid.to_scene(np.array(high)))

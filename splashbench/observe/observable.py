@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from splashbench.observe.container import depth_image, hidden
 from splashbench.observe.grid import Bounds
+from splashbench.observe.mask_distance import signed_distance_2d
 from splashbench.observe.occlusion import ContainerOcclusion, focal_length
-from splashbench.observe.silhouettes import Silhouettes, signed_distance_2d
+from splashbench.observe.silhouettes import Silhouettes
 from splashbench.scene.camera import Camera
 from splashbench.scene.scene import TrainingScene
 
@@ -151,7 +152,7 @@ def _disagreement(
     widths = []
     for t in frames:
         inside = [silhouettes.distance(view, t) for view in range(len(cameras))]
-        trusted = [view for view in range(len(cameras)) if not silhouettes.failed_masks[t, view]]
+        trusted = [view for view in range(len(cameras)) if silhouettes.trusted(view, t)]
         for view in trusted:
             others = [other for other in trusted if other != view]
             if others and (inside[view] < 0).any():

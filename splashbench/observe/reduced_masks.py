@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splashbench.observe.silhouettes import ImageWindow, MaskedScene, Silhouettes
+from splashbench.observe.image_window import ImageWindow
+from splashbench.observe.silhouettes import MaskedScene, Silhouettes
 
 #: pixels per voxel that are kept, at least
 PIXELS_PER_VOXEL = 2.0

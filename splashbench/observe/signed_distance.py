@@ -84,7 +84,7 @@ def signed_distance_frames(
     container: where given, no liquid is in its walls, and what it hides from a view is not held against the liquid.
     frames: which ones; all by default.
     """
-    carving = None if container is None else CarvingOcclusion(container, silhouettes, grid)
+    carving = CarvingOcclusion.of(container, silhouettes, grid)
     for t in range(silhouettes.n_frames) if frames is None else frames:
         phi = carve_frame(silhouettes, grid, t, carving)
         yield phi if method == "silhouette" else signed_distance_of(phi < 0)

@@ -4,17 +4,21 @@ A view whose mask is empty while other views see liquid is a failed mask, not ev
 caller has found wanting (failures.py). Either is replaced by what the view saw just before and after, with what is
 left of the mask, or over the whole sequence where those failed too. (Letting k of n views dissent everywhere instead
 was measured to cost .1 mIoU.) The paper replaces none: liquid is where the masks of all views have it.
+
+Where an image cuts liquid off, what is past that side is not seen, which is no evidence of absence either (cut_off.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from splashbench.errors import SplashbenchError
+from splashbench.observe.cut_off import CutOff
+from splashbench.observe.image_window import ImageWindow
+from splashbench.observe.mask_distance import blended, signed_distance_2d
 from splashbench.scene.camera import Camera
 
 MARGIN_PIXELS = 8
@@ -23,6 +27,8 @@ MIN_WITNESSES = 2
 NO_EVIDENCE = -1e6
 # A camera that exposes at another time than the scene's, by more than this share of a step, is interpolated.
 _SAME_TIME = 0.01
+# Of a camera that starts later or stops earlier than the scene by more steps than this, no mask stands for such times.
+_TOO_FAR = 0.5
 # Frames within which others stand in for a failed mask; farther off the liquid has moved on.
 _NEIGHBOURS = 2
 
@@ -41,91 +47,13 @@ class MaskedScene(Protocol):
     def mask(self, camera: str, t: int) -> np.ndarray: ...
 
 
-@dataclass(frozen=True)
-class ImageWindow:
-    """Rows [y0, y1) and columns [x0, x1) of an image."""
-
-    y0: int
-    y1: int
-    x0: int
-    x1: int
-
-    @classmethod
-    def around(cls, mask: np.ndarray, margin: int = 0) -> ImageWindow:
-        """The bounding box of `mask` [H, W], `margin` pixels larger within the image; two pixels where it is empty."""
-        height, width = mask.shape
-        rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
-        if len(rows) == 0:
-            return cls(0, min(2, height), 0, min(2, width))
-        return cls(
-            max(int(rows[0]) - margin, 0),
-            min(int(rows[-1]) + 1 + margin, height),
-            max(int(columns[0]) - margin, 0),
-            min(int(columns[-1]) + 1 + margin, width),
-        )
-
-    def joined(self, other: ImageWindow) -> ImageWindow:
-        """The smallest window that holds both."""
-        return ImageWindow(
-            min(self.y0, other.y0), max(self.y1, other.y1), min(self.x0, other.x0), max(self.x1, other.x1)
-        )
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.y1 - self.y0, self.x1 - self.x0
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        return slice(self.y0, self.y1), slice(self.x0, self.x1)
-
-    @property
-    def corner(self) -> np.ndarray:
-        """Its top-left pixel (x, y), float64 [2]."""
-        return np.array([self.x0, self.y0], dtype=np.float64)
-
-
-def _inner(mask: np.ndarray) -> np.ndarray:
-    """Distance in pixels from the pixels of `mask` to its outline, float32 [h, w], -0.5 outside it."""
-    import cv2
-
-    distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # OpenCV's root differs in the last bit with the alignment of its buffers; the squares are whole numbers.
-    return np.sqrt(np.rint(distance**2)) - np.float32(0.5)
-
-
-def outline_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance in pixels from the pixels of `mask` [h, w] to its outline, float32, below 0 outside it; infinite where
-    there is no outline."""
-    if not mask.any() or mask.all():
-        return np.full(mask.shape, np.inf if mask.any() else -np.inf, np.float32)
-    return np.where(mask, _inner(mask), -_inner(~mask)).astype(np.float32)
-
-
-def inner_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance in pixels from the pixels of `mask` [h, w] to its outline, float32, -0.5 outside it; see below."""
-    return np.ascontiguousarray(_inner(np.pad(mask, 1))[1:-1, 1:-1])
-
-
-def signed_distance_2d(mask: np.ndarray) -> np.ndarray:
-    """Signed distance in pixels from pixel centres to the outline of `mask`, negative inside.
-
-    mask: bool [h, w]; the result is float32 [h, w].
-    The outline runs between pixels, half a pixel from the centres on either side. Beyond the image there is no liquid.
-    An empty mask is farther than anything in the image.
-    """
-    if not mask.any():
-        return np.full(mask.shape, float(sum(mask.shape)), dtype=np.float32)
-    padded = np.pad(mask, 1)
-    distance = np.where(padded, -_inner(padded), _inner(~padded))
-    return np.ascontiguousarray(distance[1:-1, 1:-1])
-
-
 class Silhouettes:
     """Liquid masks of all frames of some views, as packed bits of the windows that hold all the liquid of a view.
 
     Attributes:
         views, cameras, n_frames: names and cameras of the views that carve; frames of the scene.
-        windows: of each view, the part of its images that the masks are kept of; beyond it there is no liquid.
+        windows: of each view, the part of its images that the masks are kept of; beyond it no liquid is seen.
+        cut_off: of each view, what lies past its images where they cut liquid off; None where they do not.
         sees_liquid: bool [T, V], whether a mask shows any liquid.
         failed_masks: bool [T, V], masks that are no evidence of absence; see `distrust`.
     """
@@ -150,14 +78,16 @@ class Silhouettes:
         self.cameras = [scene.cameras[view] for view in self.views]
         self.n_frames = scene.n_frames
         self.windows: list[ImageWindow] = []
+        self.cut_off: list[CutOff | None] = []
         self._packed: list[list[np.ndarray]] = []
         self.sees_liquid = np.zeros((scene.n_frames, len(self.views)), dtype=bool)
         full = True
         for number, view in enumerate(self.views):
-            packed, window, self.sees_liquid[:, number], all_full = _read(scene, view)
+            packed, window, cut_off, self.sees_liquid[:, number], all_full = _read(scene, view)
             full &= all_full
             self._packed.append(packed)
             self.windows.append(window)
+            self.cut_off.append(cut_off)
         if np.any(self.sees_liquid, axis=0).sum() < MIN_WITNESSES:
             raise SplashbenchError(
                 f"{scene.name}: fewer than {MIN_WITNESSES} training views have any liquid in their masks; "
@@ -168,8 +98,10 @@ class Silhouettes:
                 f"{scene.name}: every liquid mask of the training views is full, which tells nothing about where the "
                 "liquid is; check the folder seg/ of the scene"
             )
-        enough = self.sees_liquid.sum(axis=1) >= MIN_WITNESSES
-        self.failed_masks = ~self.sees_liquid & enough[:, None] & replace_empty
+        # An empty mask between two that show liquid is a failed one of a view that would see some.
+        witnesses = self.sees_liquid | (_bridged(self.sees_liquid) & replace_empty)
+        self._enough = self.sees_liquid.any(axis=1) & (witnesses.sum(axis=1) >= MIN_WITNESSES)
+        self.failed_masks = ~self.sees_liquid & self._enough[:, None] & replace_empty
         dry = [view for number, view in enumerate(self.views) if not self.sees_liquid[:, number].any()]
         if dry and not replace_empty:
             raise SplashbenchError(
@@ -177,11 +109,24 @@ class Silhouettes:
                 "not replaced, so that there is none anywhere; set replace_empty_masks=true, or leave the camera out"
             )
         self._between = [_between(scene, view, interpolate_times) for view in self.views]
+        self._absent = np.stack([_absent(scene, view, interpolate_times) for view in self.views], axis=1)
+        # Where hardly any camera was there, the nearest masks have to do.
+        self._absent &= (~self._absent).sum(axis=1, keepdims=True) > MIN_WITNESSES
 
     def distrust(self, masks: np.ndarray) -> None:
         """Count `masks` (bool [T, V]) as failed too, in frames that have a hull."""
-        enough = np.array([self.has_liquid(t) for t in range(self.n_frames)])
-        self.failed_masks |= masks & enough[:, None]
+        self.failed_masks |= masks & self._enough[:, None]
+
+    def evidence_window(self, view: int) -> ImageWindow:
+        """The window beyond which view number `view` says that there is no liquid: that of its masks, with what lies
+        past its images where they cut liquid off."""
+        cut_off = self.cut_off[view]
+        return self.windows[view] if cut_off is None else cut_off.window
+
+    @property
+    def that_see_liquid(self) -> list[tuple[Camera, CutOff | None]]:
+        """The cameras whose masks show any liquid, and what their images cut off."""
+        return [(self.cameras[view], self.cut_off[view]) for view in np.flatnonzero(self.sees_liquid.any(axis=0))]
 
     @property
     def between_frames(self) -> bool:
@@ -206,7 +151,14 @@ class Silhouettes:
 
     def has_liquid(self, t: int) -> bool:
         """Whether enough views see liquid in frame `t` for a hull."""
-        return int(self.sees_liquid[t].sum()) >= MIN_WITNESSES
+        return bool(self._enough[t])
+
+    def trusted(self, view: int, t: int) -> bool:
+        """Whether view number `view` was there in frame `t`, and no mask that it is carved with then has failed."""
+        if self._absent[t, view]:
+            return False
+        first, second, share = self._between[view][t]
+        return not (self.failed_masks[first, view] or (share > 0 and self.failed_masks[second, view]))
 
     def failed(self, t: int) -> list[str]:
         """Views whose mask of frame `t` is replaced: empty although other views see liquid, or distrusted."""
@@ -240,8 +192,10 @@ class Silhouettes:
     def distance(self, view: int, t: int, window: ImageWindow | None = None) -> np.ndarray:
         """2-D signed distance of view number `view` at the time of frame `t`, float32, of `window`.
 
-        window: one that holds the view's own, which is the default.
+        window: one that holds the view's own, which is the default; liquid may be past the image in it.
         """
+        if self._absent[t, view]:
+            return self._no_evidence(view, window)
         first, second, share = self._between[view][t]
         distance = self._frame_distance(view, first, window)
         if share == 0:
@@ -250,48 +204,59 @@ class Silhouettes:
 
     def inside(self, view: int, t: int) -> np.ndarray:
         """Where `distance` of the view's window is below 0, bool; without computing it where no masks are blended."""
+        if self._absent[t, view]:
+            return np.ones(self.windows[view].shape, dtype=bool)
         first, _, share = self._between[view][t]
         return self.evidence_mask(view, first) if share == 0 else self.distance(view, t) < 0
 
     def sequence_distance(self, view: int, window: ImageWindow | None = None) -> np.ndarray:
-        """2-D signed distance to everything that view number `view` ever sees as liquid, of `window`."""
-        return self._distance(view, self.sequence_mask(view), window)
+        """2-D signed distance to everything that view number `view` ever sees as liquid, of `window`.
+
+        A view that was not there all the time says nothing of that.
+        """
+        if self._absent[:, view].any():
+            return self._no_evidence(view, window)
+        return self._distance(view, self.sequence_mask(view), window, 0, self.n_frames - 1)
 
     def certain_distance(self, view: int, t: int, window: ImageWindow | None = None) -> np.ndarray:
         """2-D signed distance to `certain_mask`, of `window`."""
-        return self._distance(view, self.certain_mask(view, t), window)
+        return self._distance(view, self.certain_mask(view, t), window, t, t)
+
+    def _no_evidence(self, view: int, window: ImageWindow | None) -> np.ndarray:
+        return np.full((window or self.windows[view]).shape, NO_EVIDENCE, dtype=np.float32)
 
     def _frame_distance(self, view: int, t: int, window: ImageWindow | None) -> np.ndarray:
-        return self._distance(view, self.evidence_mask(view, t), window)
+        anywhere = self.failed_masks[t, view] and not self._neighbours(view, t)
+        first, last = (0, self.n_frames - 1) if anywhere else (t, t)
+        return self._distance(view, self.evidence_mask(view, t), window, first, last)
 
-    def _distance(self, view: int, mask: np.ndarray, window: ImageWindow | None) -> np.ndarray:
+    def _distance(self, view: int, mask: np.ndarray, window: ImageWindow | None, first: int, last: int) -> np.ndarray:
+        """first, last: the frames that `mask` is of."""
         mask_window = self.windows[view]
         if window is not None and window != mask_window:
-            mask = np.pad(
-                mask,
-                (
-                    (mask_window.y0 - window.y0, window.y1 - mask_window.y1),
-                    (mask_window.x0 - window.x0, window.x1 - mask_window.x1),
-                ),
-            )
+            mask = np.pad(mask, mask_window.margins(window))
+            if (cut_off := self.cut_off[view]) is not None and window.holds(cut_off.window):
+                mask |= np.pad(cut_off.liquid(first, last), cut_off.window.margins(window))
         if not mask.any() and not self.sees_liquid[:, view].any():
             # A camera without a single usable mask votes for nothing and against nothing.
-            return np.full(mask.shape, NO_EVIDENCE, dtype=np.float32)
+            return self._no_evidence(view, window)
         return signed_distance_2d(mask)
 
 
-def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], ImageWindow, np.ndarray, bool]:
-    """Masks of a view as packed bits of their common window, that window, which show liquid [T], whether all are full.
+def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], ImageWindow, CutOff | None, np.ndarray, bool]:
+    """Masks of a view as packed bits of their common window; that window, what is past the images, which show liquid
+    [T], whether all are full.
 
     Packed one by one, as all masks at once would be eight times as large.
     """
     ever: np.ndarray | None = None
-    masks = []
+    masks, borders = [], []
     full = True
     for t in range(scene.n_frames):
         mask = scene.mask(view, t)
         ever = mask.copy() if ever is None else np.logical_or(ever, mask, out=ever)
         full &= bool(mask.all())
+        borders.append((mask[:, 0].copy(), mask[:, -1].copy(), mask[0].copy(), mask[-1].copy()))
         masks.append(np.packbits(mask))
     assert ever is not None
     window = ImageWindow.around(ever, MARGIN_PIXELS)
@@ -299,7 +264,26 @@ def _read(scene: MaskedScene, view: str) -> tuple[list[np.ndarray], ImageWindow,
     for t, bits in enumerate(masks):
         mask = np.unpackbits(bits, count=ever.size).reshape(ever.shape)[window.slices]
         masks[t] = np.packbits(mask)
-    return masks, window, sees, full
+    left, right, top, bottom = (np.stack(border) for border in zip(*borders))
+    return masks, window, CutOff.of((left, right, top, bottom), window), sees, full
+
+
+def _absent(scene: MaskedScene, view: str, interpolate: bool | None) -> np.ndarray:
+    """Frames whose time is more than `_TOO_FAR` steps before the first one of `view` or after its last: bool [T]."""
+    times, exposed = getattr(scene, "times", None), getattr(scene, "camera_times", {}).get(view)
+    if interpolate is False or times is None or exposed is None or scene.n_frames < 2:
+        return np.zeros(scene.n_frames, dtype=bool)
+    far = _TOO_FAR * float(np.diff(times).mean())
+    return np.asarray((times < exposed[0] - far) | (times > exposed[-1] + far))
+
+
+def _bridged(sees: np.ndarray) -> np.ndarray:
+    """Of bool [T, V]: the frames in which a view has one in which it sees liquid shortly before, and one after."""
+    before, after = np.zeros_like(sees), np.zeros_like(sees)
+    for off in range(1, _NEIGHBOURS + 1):
+        before[off:] |= sees[:-off]
+        after[:-off] |= sees[off:]
+    return before & after
 
 
 def _between(scene: MaskedScene, view: str, interpolate: bool | None) -> list[tuple[int, int, float]]:
@@ -317,20 +301,3 @@ def _between(scene: MaskedScene, view: str, interpolate: bool | None) -> list[tu
         share = float(np.clip((time - exposed[before]) / (exposed[before + 1] - exposed[before]), 0.0, 1.0))
         alone[t] = (before, before + 1, share) if share < 1 else (before + 1, before + 1, 0.0)
     return alone
-
-
-def blended(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
-    """The signed distance between two frames: (1 - share) first + share second, float32 [h, w].
-
-    A part of the nearer frame that moves by more than its own size would vanish between the two; it stays where it is.
-    """
-    import cv2
-
-    between = (1 - np.float32(share)) * first + np.float32(share) * second
-    nearer = first if share <= 0.5 else second
-    count, labels = cv2.connectedComponents((nearer < 0).astype(np.uint8), connectivity=8)
-    present = np.zeros(count, dtype=bool)
-    present[labels[between < 0]] = True
-    lost = ~present
-    lost[0] = False
-    return np.where(lost[labels], np.minimum(nearer, between), between)

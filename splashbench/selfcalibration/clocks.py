@@ -4,6 +4,9 @@ A droplet and the line between two cameras span a plane, and both cameras have t
 the same time (the epipolar constraint). So a droplet that crosses planes tells when one camera saw it where the other
 did. Nobody knows which droplet is which: every two that fly alike in both views have a vote, and those that are the
 same agree, while all others scatter (a Hough transform over the offset).
+
+Where it is known roughly how far clocks are apart (thickness.py), droplets are asked for the rest. Cameras of which
+they do not tell keep what is known roughly.
 """
 
 from __future__ import annotations
@@ -31,8 +34,8 @@ _FALLS = (2.0, 5.0, 12.0, 30.0)
 _OFTEN, _BESIDE = 0.35, 1.5
 # Two droplets fly alike where their speeds across planes differ by less, and their accelerations.
 _ALIKE, _ALIKE_FALL = 0.5, 0.8
-#: Offsets that are looked for, in timesteps, either way.
-REACH = 2.5
+#: Offsets that are looked for, in timesteps, either way; and about offsets that are known roughly.
+REACH, NEAR_REACH = 2.5, 1.0
 # Width of a bin and of the smoothing, in timesteps.
 _BIN, _SMOOTH = 0.01, 0.02
 # Votes at the peak below which nothing is known, how many times as high it has to be as the votes beside it, and as the
@@ -44,8 +47,8 @@ _NEARLY = 0.5
 _MUCH_CLEARER = 1.3
 # Cameras that have to agree, for one to be off.
 _LEAST_CAMERAS = 3
-# Offsets below are no offsets, in timesteps.
-_SAME = 0.03
+# Offsets below are no offsets, in timesteps; and offsets that are known roughly.
+_SAME, _ROUGHLY_SAME = 0.03, 0.35
 # Of one mask, the largest droplets that are looked at at most; and flights through one frame of a view, those first
 # that are mistaken for the fewest others. Flights take the cube of droplets, and votes the square of flights.
 _MOST_DROPLETS, _MOST_FLIGHTS = 80, 400
@@ -55,13 +58,14 @@ _NEAR = 0.52
 
 @dataclass(frozen=True)
 class Offset:
-    """Of one camera's clock. timesteps: by how much later than told it takes its photographs. votes: for it, beside how
-    many for the clock as told and how many for any other offset, on average."""
+    """Of one camera's clock. timesteps: by how much later than told it takes its photographs. votes: of droplets for
+    it, beside how many for the clock as told and how many for any other offset, on average; none where they do not
+    tell."""
 
     timesteps: float
-    votes: float
-    votes_as_told: float
-    votes_elsewhere: float
+    votes: float = 0.0
+    votes_as_told: float = 0.0
+    votes_elsewhere: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -75,22 +79,68 @@ class _Flights:
 
 
 def clock_offsets(
-    droplets: Mapping[str, Sequence[NDArray[np.float64]]], cameras: Mapping[str, Camera], down: NDArray[np.float64]
+    droplets: Mapping[str, Sequence[NDArray[np.float64]]],
+    cameras: Mapping[str, Camera],
+    down: NDArray[np.float64],
+    roughly: Mapping[str, float] | None = None,
 ) -> dict[str, Offset]:
     """The offset of each camera, by its `droplets_of` of all frames; cameras that nothing is known of have none.
 
-    down: the direction of gravity, roughly, a unit vector [3].
+    down: the direction of gravity, roughly, a unit vector [3]. roughly: `rough_offsets` of the cameras that have one.
     """
+    roughly = roughly or {}
+    known = bool(roughly)
+    # Whole timesteps are taken out beforehand.
+    whole = {name: round(roughly.get(name, 0.0) - _middle(roughly)) for name in droplets}
+    shifted = {name: _shifted(drops, whole[name]) for name, drops in droplets.items()}
+    rest = {name: value - _middle(roughly) - whole[name] for name, value in roughly.items()}
+    found = _by_droplets(shifted, cameras, down, NEAR_REACH if known else REACH)
+    if known:
+        # What droplets say of a camera otherwise than all liquid does is a mistake.
+        between = {name: offset.timesteps - rest[name] for name, offset in found.items() if name in rest}
+        gauge = float(np.median(list(between.values()))) if between else 0.0
+        found = {name: found[name] for name, away in between.items() if abs(away - gauge) <= _ROUGHLY_SAME}
+        left = {name: Offset(value + gauge) for name, value in rest.items() if name not in found}
+        found = {**found, **left}
+    offsets = {name: replace(offset, timesteps=offset.timesteps + whole[name]) for name, offset in found.items()}
+    if len(offsets) < _LEAST_CAMERAS:
+        return {}
+    middle = standard_of(np.array([offset.timesteps for offset in offsets.values()]))
+    moved = {name: replace(offset, timesteps=offset.timesteps - middle) for name, offset in offsets.items()}
+    return {
+        name: offset
+        for name, offset in moved.items()
+        if abs(offset.timesteps) > (_SAME if offset.votes else _ROUGHLY_SAME)
+    }
+
+
+def _middle(offsets: Mapping[str, float]) -> float:
+    return standard_of(np.array(list(offsets.values()))) if offsets else 0.0
+
+
+def _shifted(drops: Sequence[NDArray[np.float64]], later: int) -> list[NDArray[np.float64]]:
+    """Droplets of all frames of a camera that takes each of them `later` timesteps later than told, by when it does."""
+    nothing = np.zeros((0, 2))
+    return [drops[t - later] if 0 <= t - later < len(drops) else nothing for t in range(len(drops))]
+
+
+def _by_droplets(
+    droplets: Mapping[str, Sequence[NDArray[np.float64]]],
+    cameras: Mapping[str, Camera],
+    down: NDArray[np.float64],
+    reach: float,
+) -> dict[str, Offset]:
+    """The offsets, no more than `reach`, of the cameras of which droplets tell. All may be off by as much together."""
     views = tuple(droplets)
     scale = {name: _scale(cameras[name]) for name in views}
     best: _Election | None = None
     for fall in _FALLS:
         flights = {name: _flights(droplets[name], cameras[name], down, fall, scale[name]) for name in views}
         votes = {
-            (a, b): _votes(cameras[a], cameras[b], flights[a], flights[b], max(scale[a], scale[b]))
+            (a, b): _votes(cameras[a], cameras[b], flights[a], flights[b], max(scale[a], scale[b]), reach)
             for a, b in combinations(views, 2)
         }
-        election = _Election(views, votes)
+        election = _Election(views, votes, reach)
         best = election if best is None or election.clarity > best.clarity else best
     assert best is not None
     return best.result()
@@ -99,8 +149,10 @@ def clock_offsets(
 class _Election:
     """What droplets that fall at most so fast say. votes: of each two views. clarity: how much clearer than chance."""
 
-    def __init__(self, views: tuple[str, ...], votes: Mapping[tuple[str, str], NDArray[np.float64]]) -> None:
-        self.views, self.votes = views, votes
+    def __init__(
+        self, views: tuple[str, ...], votes: Mapping[tuple[str, str], NDArray[np.float64]], reach: float
+    ) -> None:
+        self.views, self.votes, self.reach = views, votes, reach
         told = dict.fromkeys(views, 0.0)
         # Told clocks may be right but for one, or not right at all: from both the best is looked for.
         self.offsets, linked = self._improved(told), self._improved(self._linked())
@@ -110,7 +162,7 @@ class _Election:
 
     def _linked(self) -> dict[str, float]:
         """Offsets along the clearest pairs that join all views."""
-        peaks = {pair: _peak(found) for pair, found in self.votes.items()}
+        peaks = {pair: _peak(found, self.reach) for pair, found in self.votes.items()}
         offsets = {self.views[0]: 0.0}
         while len(offsets) < len(self.views):
             ways = [pair for pair in peaks if (pair[0] in offsets) != (pair[1] in offsets)]
@@ -127,7 +179,7 @@ class _Election:
         for _ in range(2 * len(self.views)):
             gains = {}
             for name in self.views:
-                found = _peak(self._of(name, offsets))
+                found = _peak(self._of(name, offsets), self.reach)
                 if abs(found.timesteps) > _SAME and _is_clear(found):
                     gains[name] = found
             if not gains:
@@ -152,7 +204,7 @@ class _Election:
         return np.concatenate(mine)
 
     def result(self) -> dict[str, Offset]:
-        """The offsets of the cameras whose droplets agree, from the clock that most of these have."""
+        """The offsets of the cameras whose droplets agree."""
         clear = {}
         for name in self.views:
             now = _peak(self._of(name, self.offsets), reach=_SAME)
@@ -160,11 +212,7 @@ class _Election:
             found = Offset(self.offsets[name], now.votes, told, now.votes_elsewhere)
             if _is_clear(found, compared=abs(self.offsets[name]) > _SAME):
                 clear[name] = found
-        if len(clear) < _LEAST_CAMERAS:
-            return {}
-        middle = standard_of(np.array([found.timesteps for found in clear.values()]))
-        moved = {name: replace(found, timesteps=found.timesteps - middle) for name, found in clear.items()}
-        return {name: found for name, found in moved.items() if abs(found.timesteps) > _SAME}
+        return clear if len(clear) >= _LEAST_CAMERAS else {}
 
 
 def _flights(
@@ -232,9 +280,11 @@ def droplets_of(masks: Iterable[NDArray[np.bool_]], camera: Camera) -> list[NDAr
     return [drops[often[drops[:, 1].astype(int), drops[:, 0].astype(int)] <= most] for drops in found]
 
 
-def _votes(first: Camera, second: Camera, of_first: _Flights, of_second: _Flights, scale: float) -> NDArray[np.float64]:
+def _votes(
+    first: Camera, second: Camera, of_first: _Flights, of_second: _Flights, scale: float, most: float
+) -> NDArray[np.float64]:
     """By how many timesteps later than `first` told `second` saw what may be the same droplet, and how much
-    that counts: float64 [n, 2]."""
+    that counts: float64 [n, 2]. most: timesteps that are looked at."""
     base = second.center - first.center
     if not len(of_first.frame) or not len(of_second.frame) or np.linalg.norm(base) < 1e-9:
         return np.zeros((0, 2))
@@ -247,7 +297,7 @@ def _votes(first: Camera, second: Camera, of_first: _Flights, of_second: _Flight
     here = _plane(first, of_first.places, axes)
     there = _plane(second, of_second.places, axes)
     found = []
-    reach = int(REACH) + 1
+    reach = int(most) + 1
     for t in np.unique(of_first.frame):
         mine = here[of_first.frame == t]
         place, speed, fall = mine[:, 1], (mine[:, 2] - mine[:, 0]) / 2, mine[:, 2] - 2 * mine[:, 1] + mine[:, 0]

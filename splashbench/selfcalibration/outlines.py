@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from splashbench.background.median import masked_median
-from splashbench.observe.silhouettes import outline_distance
+from splashbench.observe.mask_distance import outline_distance
 from splashbench.parallel import each
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene

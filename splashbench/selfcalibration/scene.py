@@ -21,6 +21,7 @@ from .exposure import Response, responses
 from .features import find_tracks
 from .outlines import Outlines, examined
 from .stance import Knock, find_knock
+from .thickness import Thickness, rough_offsets
 from .unmasked import hardly_masked, outlines_by_change, unconfirmed
 
 Plates = Mapping[str, CleanPlate]
@@ -245,7 +246,13 @@ def self_calibration(
             name: droplets_of((right.mask(name, t) for t in range(scene.n_frames)), right.cameras[name])
             for name in scene.train
         }
-        found = replace(found, offsets=clock_offsets(drops, right.cameras, _down(right)))
+        roughly = rough_offsets(
+            {
+                name: Thickness.of((right.mask(name, t) for t in range(scene.n_frames)), right.cameras[name])
+                for name in scene.train
+            }
+        )
+        found = replace(found, offsets=clock_offsets(drops, right.cameras, _down(right), roughly))
     return found
 
 

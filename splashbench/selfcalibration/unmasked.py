@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from splashbench.observe.silhouettes import outline_distance
+from splashbench.observe.mask_distance import outline_distance
 from splashbench.scene.frames import spread_frames
 from splashbench.scene.scene import TrainingScene
 

@@ -310,10 +310,12 @@ class AnyMasks:
 def test_blocks_change_nothing_whatever_masks_and_cameras_are(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(seed)
     silhouettes = Silhouettes(AnyMasks(rng))
+    assert any(silhouettes.cut_off)
     low = rng.uniform(-1.0, -0.4, 3)
     grid = Grid.over(Bounds(low, low + rng.uniform(0.9, 1.4, 3)), int(rng.integers(70, 120)))
     corners = np.sort(rng.uniform(-0.9, 0.9, (2, 3)), axis=0)
-    carving = CarvingOcclusion(ContainerOcclusion(box(*map(tuple, corners))), silhouettes, grid) if seed % 3 else None
+    container = ContainerOcclusion(box(*map(tuple, corners))) if seed % 3 else None
+    carving = CarvingOcclusion.of(container, silhouettes, grid)
     monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1)
     by_blocks = hull.carve_frame(silhouettes, grid, 0, carving)
     monkeypatch.setattr(hull, "_WORTH_BLOCKS", 1000)

@@ -8,7 +8,7 @@ import pytest
 from splashbench.errors import SplashbenchError
 from splashbench.observe import Silhouettes, distrust_failed_masks, sequence_bounds, signed_distance_fields
 from splashbench.observe.failures import missing_shares
-from splashbench.observe.silhouettes import blended, signed_distance_2d
+from splashbench.observe.mask_distance import blended, signed_distance_2d
 from splashbench.scene import Camera, Scene, look_at
 
 FOCAL, WIDTH, HEIGHT = 260.0, 160, 120
@@ -120,6 +120,52 @@ def test_two_views_make_a_hull() -> None:
     scene = MovingBall(views=2)
     fields = signed_distance_fields(scene, 32, detect_failed_masks=True)
     assert min(inside(scene, fields, t) for t in range(scene.n_frames)) > 0.99
+
+
+def test_an_empty_mask_of_one_of_two_views_blanks_no_frame() -> None:
+    scene = MovingBall(views=2)
+    scene.changed = {("1", 4): "empty"}
+    silhouettes = Silhouettes(scene)
+    assert silhouettes.failed(4) == ["1"]
+    fields = signed_distance_fields(scene, 32)
+    assert inside(scene, fields, 4) > 0.99
+    # What the view saw just before and after stands in.
+    assert (fields.phi[4] < 0).sum() < 1.7 * (fields.phi[3] < 0).sum()
+    # Without frames on both sides nothing says that there was liquid, nor does one view's word alone.
+    scene.changed = {("1", t): "empty" for t in (0, 1, 4)} | {("0", 4): "empty"}
+    assert [Silhouettes(scene).has_liquid(t) for t in (0, 1, 2, 4)] == [False, False, True, False]
+    kept = Silhouettes(scene, replace_empty=False)
+    assert not kept.has_liquid(4)
+    scene.changed = {("1", 4): "empty"}
+    assert not Silhouettes(scene, replace_empty=False).has_liquid(4)
+
+
+def test_a_camera_is_no_witness_of_times_before_it_started_and_after_it_stopped() -> None:
+    scene = MovingBall()
+    scene.camera_times["1"] = scene.times + 3.2
+    scene.camera_times["3"] = scene.times - 0.9
+    silhouettes = Silhouettes(scene)
+    assert [silhouettes.trusted(1, t) for t in range(9)] == [False] * 3 + [True] * 6
+    assert [silhouettes.trusted(3, t) for t in range(9)] == [True] * 8 + [False]
+    assert silhouettes.inside(1, 0).all()
+    assert (silhouettes.distance(1, 0) < 0).all()
+    assert not silhouettes.inside(1, 3).all()
+    fields = signed_distance_fields(scene, 40)
+    assert min(inside(scene, fields, t) for t in range(9)) > 0.97
+    # Of three cameras two are left, which is too few to do without the nearest mask of the third.
+    scene = MovingBall(views=3)
+    scene.camera_times["1"] = scene.times + 3.2
+    assert all(Silhouettes(scene).trusted(1, t) for t in range(9))
+
+
+def test_masks_between_which_a_time_lies_are_trusted_together() -> None:
+    scene = MovingBall()
+    scene.camera_times["1"] = scene.times + 0.4
+    scene.changed = {("1", 4): "empty"}
+    silhouettes = Silhouettes(scene)
+    assert silhouettes.failed(4) == ["1"]
+    # Frame 4 is at a time between the camera's frames 3 and 4, frame 5 between 4 and 5.
+    assert [silhouettes.trusted(1, t) for t in (3, 4, 5, 6)] == [True, False, False, True]
 
 
 def test_cameras_that_look_elsewhere_are_one_line() -> None:

@@ -12,8 +12,8 @@ from scipy import ndimage
 from splashbench.errors import SplashbenchError
 from splashbench.observe import Bounds, Grid, Silhouettes, sequence_bounds, signed_distance_fields
 from splashbench.observe.kernels import resample, sample
+from splashbench.observe.mask_distance import signed_distance_2d
 from splashbench.observe.signed_distance import signed_distance_frames, signed_distance_of
-from splashbench.observe.silhouettes import signed_distance_2d
 from splashbench.scene.camera import Camera, look_at
 
 RADIUS = 0.25

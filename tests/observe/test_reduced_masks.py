@@ -64,7 +64,7 @@ def test_points_fall_on_the_same_place_of_the_reduced_image():
 def test_the_hull_is_the_same_to_a_fraction_of_a_voxel(factor: int):
     scene = BallScene()
     grid = Grid.over(Bounds(np.full(3, -0.7), np.full(3, 0.7)), 28)
-    full, small = (carve_frame(Silhouettes(one), grid, 0) for one in (scene, ReducedScene(scene, factor)))
+    full, small = (carve_frame(Silhouettes(one), grid, 0, None) for one in (scene, ReducedScene(scene, factor)))
     near = np.abs(full) < 3
     pixels_per_voxel = 900 / 4 * grid.voxel / factor
     assert np.abs(full - small)[near].max() < 1.5 / pixels_per_voxel

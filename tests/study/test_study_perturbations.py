@@ -25,6 +25,7 @@ from splashbench.study.perturbations.cameras import (
     PoseRotation,
     PoseTranslation,
     PrincipalPointError,
+    TightFraming,
 )
 from splashbench.study.perturbations.clocks import (
     ClockDrift,
@@ -307,6 +308,28 @@ def test_a_knocked_camera_sees_as_if_turned_from_the_middle_on() -> None:
         shifts.append(after - before)
     assert np.ptp(shifts, axis=0).max() < 0.8  # one turn, and one only
     assert 0.2 < np.linalg.norm(np.mean(shifts, axis=0)) < 90 * np.tan(np.radians(2.0)) * 1.3
+
+
+@pytest.mark.parametrize("amount", [0.35, 0.7])
+def test_a_camera_that_is_zoomed_in_sees_a_part_and_knows(amount: float) -> None:
+    given, times = recording(), 1 / (1 - amount)
+    worse = perturbed(given, [TightFraming(amount=amount)], DICE)
+    (name,) = (name for name in given.views if not np.array_equal(worse.cameras[name].K, given.cameras[name].K))
+    before, after = given.cameras[name], worse.cameras[name]
+    assert (after.width, after.height) == (WIDTH, HEIGHT)
+    points = np.random.default_rng(0).normal(scale=0.1, size=(20, 3))
+    middle = np.array([WIDTH, HEIGHT]) / 2
+    np.testing.assert_allclose(
+        after.project(points)[0] - middle, times * (before.project(points)[0] - middle), atol=1e-9
+    )
+    # The disc's middle is seen where the camera says, as long as the image has all of it.
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for t in range(FRAMES):
+        at = times * (np.array([30 + 4 * t, 24 + 4 * int(name)]) - middle) + middle
+        expected = (columns - at[0]) ** 2 + (rows - at[1]) ** 2 < (10 * times) ** 2
+        assert (worse.mask(name, t) ^ expected).mean() < 0.02
+    cut = [worse.mask(name, t)[:, [0, -1]].any() or worse.mask(name, t)[[0, -1]].any() for t in range(FRAMES)]
+    assert any(cut) or amount < 0.5
 
 
 # --- masks

@@ -13,8 +13,9 @@ import numba
 import numpy as np
 
 from splashbench.observe.grid import Grid
+from splashbench.observe.image_window import ImageWindow
 from splashbench.observe.kernels import trilinear
-from splashbench.observe.silhouettes import ImageWindow, Silhouettes
+from splashbench.observe.silhouettes import Silhouettes
 from splashbench.parallel import over_range
 from splashbench.scene.camera import Camera
 
@@ -125,7 +126,7 @@ def uncovered_by_any(
     """`uncovered` of all views whose mask of frame `t` is trusted, float32 [M, 3]."""
     points = [np.zeros((0, 3), np.float32)]
     for view, (camera, depth) in enumerate(zip(silhouettes.cameras, container_depths)):
-        if not silhouettes.failed_masks[t, view]:
+        if silhouettes.trusted(view, t):
             mask = silhouettes.inside(view, t)
             points.append(uncovered(phi, grid, camera, mask, silhouettes.windows[view], depth, reach, scale))
     return np.concatenate(points)

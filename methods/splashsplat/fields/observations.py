@@ -40,7 +40,7 @@ from .rim import Rim, rim_of
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 13
+_REVISION = 14
 # Pixels that a voxel of a coarse grid spans, at least, where smaller masks stand for large ones.
 _COARSE_PIXELS = 3.0
 

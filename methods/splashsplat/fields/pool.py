@@ -19,8 +19,9 @@ import numba
 import numpy as np
 
 from splashbench.observe.grid import Grid
+from splashbench.observe.mask_distance import signed_distance_2d
 from splashbench.observe.occlusion import focal_length
-from splashbench.observe.silhouettes import Silhouettes, signed_distance_2d
+from splashbench.observe.silhouettes import Silhouettes
 from splashbench.parallel import over_range
 from splashbench.scene.camera import Camera
 

@@ -7,7 +7,15 @@ from typing import Annotated, get_args
 
 from pydantic import Field
 
-from .cameras import CameraMoved, FocalError, LensDistortion, PoseRotation, PoseTranslation, PrincipalPointError
+from .cameras import (
+    CameraMoved,
+    FocalError,
+    LensDistortion,
+    PoseRotation,
+    PoseTranslation,
+    PrincipalPointError,
+    TightFraming,
+)
 from .clocks import ClockDrift, ClockOffset, ClockOffsets, DoubledFrames, DroppedFrames, MotionBlur, RollingShutter
 from .images import (
     Compression,
@@ -58,6 +66,7 @@ Perturbation = Annotated[
     | PrincipalPointError
     | LensDistortion
     | CameraMoved
+    | TightFraming
     | MissingCameras
     | GravityError
     | ContainerMisplaced

@@ -153,6 +153,29 @@ class CameraMoved(Step):
         return _warped(recording, {chosen: (place[0], place[1])}, start=recording.n_frames / 2)
 
 
+class TightFraming(Step):
+    """One camera is zoomed in, and told so: `amount` of its images' width and height is cut off about the middle."""
+
+    kind: Literal["tight_framing"] = "tight_framing"
+    amount: float = Field(ge=0, le=0.9)
+    unit: ClassVar[str] = "share of the image's width"
+    remedy: ClassVar[str] = "Frame all the liquid in every camera, with room for what splashes out."
+    ladder: ClassVar[tuple[float, ...]] = (0.2, 0.35, 0.5, 0.6, 0.7)
+
+    def applied(self, recording: Recording, dice: Dice) -> Recording:
+        chosen = str(dice.of("camera").choice(recording.views))
+        camera, times = recording.cameras[chosen], 1 / (1 - self.amount)
+        zoom = np.diag([times, times, 1.0])
+        zoom[:2, 2] = (1 - times) / 2 * np.array([camera.width, camera.height])
+        rows, columns = (
+            ((np.arange(size) + 0.5 - zoom[axis, 2]) / times - 0.5).astype(np.float32)
+            for axis, size in ((1, camera.height), (0, camera.width))
+        )
+        place_x, place_y = np.meshgrid(columns, rows)
+        told = recording.with_cameras(lambda one: replace(one, K=zoom @ one.K) if one.name == chosen else one)
+        return _warped(told, {chosen: (place_x, place_y)})
+
+
 def _warped(
     recording: Recording,
     places: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]],

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from splashbench.observe.grid import Grid
-from splashbench.observe.silhouettes import ImageWindow, Silhouettes
+from splashbench.observe.image_window import ImageWindow
+from splashbench.observe.silhouettes import Silhouettes
 from splashbench.scene import Camera, look_at
 from splashbench_methods.splashsplat.carriers.coverage import COVERED, uncovered, uncovered_by_any
 from splashbench_methods.splashsplat.carriers.population import Carriers

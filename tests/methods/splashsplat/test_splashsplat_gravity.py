@@ -9,10 +9,11 @@ from splashbench.observe import Silhouettes, sequence_bounds
 from splashbench.observe.container import depth_image
 from splashbench.observe.grid import Bounds, Grid
 from splashbench.observe.hull import carve_frame
-from splashbench.observe.occlusion import ContainerOcclusion
+from splashbench.observe.occlusion import CarvingOcclusion, ContainerOcclusion
 from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench_methods.splashsplat.carriers.visibility import seen_by_any
+from splashbench_methods.splashsplat.fields import jet as jet_module
 from splashbench_methods.splashsplat.fields.gravity_cues import GravityCues, gravity_cues
 from splashbench_methods.splashsplat.fields.jet import Jet, Slices, fit_jets, framed, open_floor, slices_of
 from splashbench_methods.splashsplat.fields.pool import LiquidPool
@@ -95,6 +96,46 @@ def test_a_jets_axis_and_width_lead_through_its_slices(speed, drift):
     assert (jet.distance(axis) < 0).all()
     radius = np.sqrt(frames[4].area / np.pi)
     np.testing.assert_allclose(-jet.distance(axis), radius, atol=0.4 * VOXEL)
+
+
+def beaded(speed: float, period: float, times: np.ndarray, gaps: bool = False) -> list[Slices]:
+    """A jet whose thickness goes up and down with when its liquid left the height .3, `period` seconds apart. Its path
+    is seen to half a voxel, so that its shape says little of its speed."""
+    frames = []
+    for t, time in enumerate(times):
+        height = (np.arange(20, 60) + 0.5) * VOXEL
+        down = np.sqrt(speed**2 + 2 * G * (0.3 - height))
+        left = time - (down - speed) / G
+        rng = np.random.default_rng(t)
+        # No two beads alike.
+        thick = 1 + 0.5 * np.sin(2 * np.pi * left / period) + 0.3 * np.sin(2 * np.pi * left / (2.3 * period))
+        area = 6e-4 / down * np.maximum(thick, 0.05) * np.exp(rng.normal(0, 0.05, len(height)))
+        middle = np.stack([0.2 * (down - speed) / G, np.zeros(len(height))], axis=1)
+        middle += rng.normal(0, 0.5 * VOXEL, middle.shape)
+        there = thick > (0.4 if gaps else 0.0)
+        frames.append(Slices(height[there], middle[there], area[there]))
+    return frames
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("speed", [0.9, 1.25, 1.6])
+@pytest.mark.parametrize("uneven", [False, True])
+def test_beads_tell_a_jets_speed_to_a_few_per_cent(speed, gaps, uneven):
+    times = np.cumsum(np.random.default_rng(1).choice([0.02, 0.03, 0.04], 40)) if uneven else np.arange(40) / 30
+    jet = fit_jets(beaded(speed, 0.022, times, gaps), times, G, VOXEL)[10]
+    assert -jet.velocity(np.array([0.3]))[0, 2] == pytest.approx(speed, rel=0.03)
+    for height in (0.15, 0.25):
+        assert -jet.velocity(np.array([height]))[0, 2] == pytest.approx(
+            (speed**2 + 2 * G * (0.3 - height)) ** 0.5, rel=0.03
+        )
+
+
+def test_noise_in_the_thickness_is_no_beads(monkeypatch):
+    times = np.arange(9) * 0.05
+    frames = falling(1.0, 0.35)
+    speed = fit_jets(frames, times, G, VOXEL)[4].speed
+    monkeypatch.setattr(jet_module, "_BEADED", np.inf)
+    assert fit_jets(frames, times, G, VOXEL)[4].speed == speed
 
 
 def test_a_falling_tip_tells_the_speed_of_a_straight_jet():
@@ -261,10 +302,13 @@ def test_motion_that_takes_arriving_liquid_away_from_where_it_was_is_dropped():
 class PouredBox:
     """A box of liquid in an open box, seen by five cameras; what `Silhouettes` needs of a scene."""
 
-    def __init__(self, level: float, opaque: bool = True, floating: bool = False) -> None:
+    def __init__(self, level: float, opaque: bool = True, floating: bool = False, cut: bool = False) -> None:
         self.name, self.n_frames, self.train = "box", 2, ("0", "1", "2", "3", "4")
         self.mesh = open_box((0.2, 0.12, 0.16), 0.008)
         self.cameras = rig(np.array([0.0, 0.05, 0.0]))
+        if cut:  # of the middle camera's images half is left
+            whole = self.cameras["2"]
+            self.cameras["2"] = whole.cropped(0, 0, whole.width // 2, whole.height)
         axes = np.meshgrid(np.linspace(-0.1, 0.1, 160), np.linspace(0, level, 60), np.linspace(-0.08, 0.08, 130))
         self.points = np.stack(axes, -1).reshape(-1, 3)
         self.opaque = opaque
@@ -317,11 +361,14 @@ def test_a_plate_is_no_vessel():
     assert Vessel.of(flat, DOWN) is None
 
 
-def test_the_dome_over_a_pool_goes_and_the_pool_is_full(poured):
+@pytest.mark.parametrize("cut", [False, True])
+def test_the_dome_over_a_pool_goes_and_the_pool_is_full(cut):
+    poured = PouredBox(0.06, cut=cut)
     silhouettes = Silhouettes(poured)
+    assert (silhouettes.cut_off[2] is not None) == cut
     container = ContainerOcclusion(poured.mesh, DOWN)
     grid = Grid.over(sequence_bounds(silhouettes, container).padded(0.1), 56)
-    phi = carve_frame(silhouettes, grid, 0)
+    phi = carve_frame(silhouettes, grid, 0, CarvingOcclusion.of(None, silhouettes, grid))
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
     settled = LiquidPool(Vessel.of(poured.mesh, DOWN), silhouettes, True).lowered(phi.copy(), grid, 0.06, depths)
     points = grid.nodes()
