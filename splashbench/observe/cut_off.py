@@ -20,6 +20,8 @@ from splashbench.scene.camera import Camera
 
 # How far past an image liquid may go, as a share of the image's longest side.
 _REACH = 0.5
+# Places along a grid's longest side by which it is told how far past the sides images have to be looked at.
+_RASTER = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +29,12 @@ class CutOff:
     """What lies past the sides of one view's images.
 
     window: of the image, with what is past the sides at which liquid is cut off: rows and columns may be negative.
-    image: the window that the image itself is. borders: of the left and right column [T, H] and the top and bottom row
-    [T, W] of the masks, where they are liquid.
+    inner: the part of it that is in the image. image: the window that the image itself is. borders: of the left and
+    right column [T, H] and the top and bottom row [T, W] of the masks, where they are liquid.
     """
 
     window: ImageWindow
+    inner: ImageWindow
     image: ImageWindow
     borders: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -50,7 +53,7 @@ class CutOff:
             -reach if left else window.x0,
             width + reach if right else window.x1,
         )
-        return cls(larger, ImageWindow(0, height, 0, width), borders)
+        return cls(larger, window, ImageWindow(0, height, 0, width), borders)
 
     @property
     def sides(self) -> tuple[bool, bool, bool, bool]:
@@ -58,22 +61,41 @@ class CutOff:
         left, right, top, bottom = (bool(border.any()) for border in self.borders)
         return left, right, top, bottom
 
-    def liquid(self, first: int, last: int) -> np.ndarray:
+    def window_of(self, camera: Camera, places: np.ndarray, reach: float) -> ImageWindow:
+        """The part of `window` in which `camera` sees what is within `reach` of `places` [N, 3], scene units, with all
+        that is in the image."""
+        whole, inner = self.window, self.inner
+        if len(places) == 0:
+            return inner
+        pixels, depth = camera.project(places)
+        nearest = float(depth.min()) - reach
+        if nearest <= 0:
+            return whole
+        margin = reach * max(camera.K[0, 0], camera.K[1, 1]) / nearest
+        (left, top), (right, bottom) = np.floor(pixels.min(axis=0) - margin), np.ceil(pixels.max(axis=0) + margin)
+        return ImageWindow(
+            min(max(whole.y0, int(top)), inner.y0),
+            max(min(whole.y1, int(bottom)), inner.y1),
+            min(max(whole.x0, int(left)), inner.x0),
+            max(min(whole.x1, int(right)), inner.x1),
+        )
+
+    def liquid(self, first: int, last: int, window: ImageWindow) -> np.ndarray:
         """Where liquid that crosses sides in the frames `first` to `last` may be past them: bool, of `window`."""
         left, right, top, bottom = (np.logical_or.reduce(border[first : last + 1]) for border in self.borders)
-        window, image = self.window, self.image
+        image = self.image
         rows, columns = np.arange(window.y0, window.y1), np.arange(window.x0, window.x1)
         liquid = np.zeros(window.shape, dtype=bool)
-        before, after = -window.x0, window.x1 - image.x1
-        if left.any():
-            liquid[:, :before] |= _aside(left, rows)[:, None] <= np.arange(before, 0, -1)
-        if right.any():
-            liquid[:, -after:] |= _aside(right, rows)[:, None] <= np.arange(1, after + 1)
-        before, after = -window.y0, window.y1 - image.y1
-        if top.any():
-            liquid[:before] |= _aside(top, columns) <= np.arange(before, 0, -1)[:, None]
-        if bottom.any():
-            liquid[-after:] |= _aside(bottom, columns) <= np.arange(1, after + 1)[:, None]
+        before, after = max(-window.x0, 0), max(window.x1 - image.x1, 0)
+        if left.any() and before:
+            liquid[:, :before] |= _aside(left, rows)[:, None] <= -columns[:before]
+        if right.any() and after:
+            liquid[:, -after:] |= _aside(right, rows)[:, None] <= columns[-after:] - (image.x1 - 1)
+        before, after = max(-window.y0, 0), max(window.y1 - image.y1, 0)
+        if top.any() and before:
+            liquid[:before] |= _aside(top, columns) <= -rows[:before, None]
+        if bottom.any() and after:
+            liquid[-after:] |= _aside(bottom, columns) <= rows[-after:, None] - (image.y1 - 1)
         return liquid
 
     @property
@@ -110,6 +132,18 @@ def in_images(views: Sequence[tuple[Camera, CutOff | None]], grid: Grid, share: 
         within,
     )
     return within
+
+
+def places_in_images(
+    views: Sequence[tuple[Camera, CutOff | None]], grid: Grid, share: float
+) -> tuple[np.ndarray, float]:
+    """Places of `grid` that the images of a `share` of the views have, [N, 3] on a raster; and how far, in scene units,
+    others may be from the nearest of these."""
+    step = max(1, max(grid.shape) // _RASTER)
+    nx, ny, nz = (-(-n // step) + 1 for n in grid.shape)
+    rough = Grid(grid.origin, grid.voxel * step, (nx, ny, nz))
+    within = in_images(views, rough, share, 1.0)
+    return rough.to_scene(np.argwhere(within > -1.0)), rough.voxel
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

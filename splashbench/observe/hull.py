@@ -100,7 +100,9 @@ class _Carver:
     ) -> None:
         self._camera = silhouettes.cameras[view]
         self._occlusion = container.views[view] if container is not None and container.views else None
-        window = silhouettes.evidence_window(view) if self._occlusion is None else self._occlusion.window
+        window = silhouettes.windows[view] if container is None else container.windows[view]
+        if self._occlusion is not None:
+            window = self._occlusion.window
         self._corner, self._evidence = window.corner, distance(view, window)
         if self._occlusion is not None:
             self._evidence = self._occlusion.evidence(self._evidence)

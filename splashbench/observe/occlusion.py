@@ -15,7 +15,7 @@ import numpy as np
 
 from splashbench.observe.carving import carve_hidden_view
 from splashbench.observe.container import depth_image, hidden, solid_distance
-from splashbench.observe.cut_off import in_images
+from splashbench.observe.cut_off import in_images, places_in_images
 from splashbench.observe.grid import Grid
 from splashbench.observe.image_window import ImageWindow
 from splashbench.observe.mask_distance import inner_distance, signed_distance_2d
@@ -40,6 +40,9 @@ _FLOOR_VOXELS = 1.0
 # Share of the views whose images have to have a place, where some cut liquid off: all but one of five. What fewer have
 # is hardly bounded along their lines of sight: with three of five a hull in a box of .42 units went on for .77.
 _IMAGES = 0.75
+# So far about the places that these images have, voxels, a view is looked at past its sides. Deeper within liquid that
+# goes on past them distances are smaller than they would be.
+_NEAR_VOXELS = 4.0
 
 
 def focal_length(camera: Camera) -> float:
@@ -210,6 +213,7 @@ class CarvingOcclusion:
         outside: float32 on `grid`, voxels: > 0 where no liquid can be, whatever the masks say: where it is
             `ContainerOcclusion.forbidden`, where fewer views than `witnesses` see past the container, and where too
             few have it in their images.
+        windows: of each view, the window beyond which it says that there is no liquid on `grid`.
         views: what the container hides from each view; empty where it hides nothing.
     """
 
@@ -225,10 +229,11 @@ class CarvingOcclusion:
             self.outside = np.full(grid.shape, -LIMIT_VOXELS, dtype=np.float32)
         else:
             self.outside = container.forbidden(grid)
+        self.windows = _evidence_windows(silhouettes, grid)
         self.views: list[ViewOcclusion] = []
         if container is not None and container.hides:
-            for view, camera in enumerate(silhouettes.cameras):
-                self.views.append(ViewOcclusion(camera, container.mesh, silhouettes.evidence_window(view)))
+            for camera, window in zip(silhouettes.cameras, self.windows):
+                self.views.append(ViewOcclusion(camera, container.mesh, window))
             np.maximum(self.outside, -self._seen(grid)[witnesses - 1], out=self.outside)
         if any(silhouettes.cut_off):
             np.maximum(
@@ -255,3 +260,16 @@ class CarvingOcclusion:
         for view in self.views:
             view.carve(best, grid, view.visibility(), second)
         return best, second
+
+
+def _evidence_windows(silhouettes: Silhouettes, grid: Grid) -> list[ImageWindow]:
+    """Those of the masks, with what lies past the images where they cut liquid off, as far as enough images have it."""
+    windows = list(silhouettes.windows)
+    if not any(silhouettes.cut_off):
+        return windows
+    places, apart = places_in_images(silhouettes.that_see_liquid, grid, _IMAGES)
+    reach = apart + _NEAR_VOXELS * grid.voxel
+    for view, (camera, cut_off) in enumerate(zip(silhouettes.cameras, silhouettes.cut_off)):
+        if cut_off is not None:
+            windows[view] = cut_off.window_of(camera, places, reach)
+    return windows

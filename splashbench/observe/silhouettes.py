@@ -117,12 +117,6 @@ class Silhouettes:
         """Count `masks` (bool [T, V]) as failed too, in frames that have a hull."""
         self.failed_masks |= masks & self._enough[:, None]
 
-    def evidence_window(self, view: int) -> ImageWindow:
-        """The window beyond which view number `view` says that there is no liquid: that of its masks, with what lies
-        past its images where they cut liquid off."""
-        cut_off = self.cut_off[view]
-        return self.windows[view] if cut_off is None else cut_off.window
-
     @property
     def that_see_liquid(self) -> list[tuple[Camera, CutOff | None]]:
         """The cameras whose masks show any liquid, and what their images cut off."""
@@ -235,8 +229,8 @@ class Silhouettes:
         mask_window = self.windows[view]
         if window is not None and window != mask_window:
             mask = np.pad(mask, mask_window.margins(window))
-            if (cut_off := self.cut_off[view]) is not None and window.holds(cut_off.window):
-                mask |= np.pad(cut_off.liquid(first, last), cut_off.window.margins(window))
+            if (cut_off := self.cut_off[view]) is not None and not cut_off.image.holds(window):
+                mask |= cut_off.liquid(first, last, window)
         if not mask.any() and not self.sees_liquid[:, view].any():
             # A camera without a single usable mask votes for nothing and against nothing.
             return self._no_evidence(view, window)

@@ -51,9 +51,14 @@ def test_liquid_may_be_in_a_cone_past_where_it_crosses(seed: int) -> None:
     assert cut_off.window.holds(window)
     for first, last in ((0, 0), (1, 2), (0, 2)):
         expected = past_by_looking(cut_off, masks[first : last + 1].any(axis=0))
-        np.testing.assert_array_equal(cut_off.liquid(first, last), expected)
-    inside = window.within(cut_off.window).slices
-    assert not cut_off.liquid(0, 2)[inside].any()
+        np.testing.assert_array_equal(cut_off.liquid(first, last, cut_off.window), expected)
+        # Of any part of it, too.
+        whole = cut_off.window
+        y0, x0 = rng.integers(whole.y0, window.y0 + 1), rng.integers(whole.x0, window.x0 + 1)
+        y1, x1 = rng.integers(window.y1, whole.y1 + 1), rng.integers(window.x1, whole.x1 + 1)
+        part = ImageWindow(int(y0), int(y1), int(x0), int(x1))
+        np.testing.assert_array_equal(cut_off.liquid(first, last, part), expected[part.within(whole).slices])
+    assert not cut_off.liquid(0, 2, window).any()
 
 
 def test_half_of_the_longest_side_is_looked_at_past_the_sides_that_cut_alone() -> None:
@@ -104,10 +109,14 @@ def test_what_one_image_cuts_off_is_not_carved_away() -> None:
     scene = CutBall(12, 0, 4, 8)
     silhouettes = Silhouettes(scene)
     assert silhouettes.cut_off[5] is None
-    assert silhouettes.evidence_window(5) == silhouettes.windows[5]
+    carving = hull_module.CarvingOcclusion.of(None, silhouettes, Grid.over(whole.bounds, 400))
+    assert carving is not None
+    assert carving.windows[5] == silhouettes.windows[5]
     cut_off = silhouettes.cut_off[4]
     assert cut_off is not None
     assert cut_off.sides == (False, True, False, False)
+    # No more than the grid needs is looked at past the sides.
+    assert 120 < carving.windows[4].x1 < cut_off.window.x1
     cut = signed_distance_fields(scene, cells_longest_axis=48)
     # The others see all of it: where they end the ball, it ends.
     assert np.abs(np.median(cut.sample(0, surface(RADIUS)) * cut.voxel)) < 0.004
@@ -116,6 +125,19 @@ def test_what_one_image_cuts_off_is_not_carved_away() -> None:
     assert np.abs(cut.sample(0, near) - whole.sample(0, near)).mean() < 0.25
     carved = signed_distance_fields(scene, cells_longest_axis=48, method="carve")
     assert np.abs(carved.sample(0, near) - cut.sample(0, near)).max() < 1.2
+
+
+def test_what_is_not_looked_at_past_the_sides_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    silhouettes = Silhouettes(CutBall(12, 0, 4, 8))
+    grid = Grid.over(sequence_bounds(silhouettes).padded(0.1), 60)
+    phi = hull_module.carve_frame(silhouettes, grid, 0, hull_module.CarvingOcclusion.of(None, silhouettes, grid))
+    monkeypatch.setattr(CutOff, "window_of", lambda self, camera, places, reach: self.window)
+    carving = hull_module.CarvingOcclusion.of(None, silhouettes, grid)
+    all_of_it = hull_module.carve_frame(silhouettes, grid, 0, carving)
+    near = np.abs(all_of_it) < 4
+    assert near.sum() > 1000
+    np.testing.assert_array_equal(phi[near], all_of_it[near])
+    np.testing.assert_array_equal(phi < 0, all_of_it < 0)
 
 
 def test_a_mask_that_ends_within_the_image_is_evidence_as_ever() -> None:
