@@ -105,7 +105,11 @@ def clock_offsets(
     offsets = {name: replace(offset, timesteps=offset.timesteps + whole[name]) for name, offset in found.items()}
     if len(offsets) < _LEAST_CAMERAS:
         return {}
-    middle = standard_of(np.array([offset.timesteps for offset in offsets.values()]))
+    middle = _middle({name: offset.timesteps for name, offset in offsets.items()})
+    # Of the cameras on that clock droplets know better when it is.
+    exact = [offset.timesteps for offset in offsets.values() if offset.votes]
+    exact = [value for value in exact if abs(value - middle) <= _ROUGHLY_SAME]
+    middle = standard_of(np.array(exact)) if exact else middle
     moved = {name: replace(offset, timesteps=offset.timesteps - middle) for name, offset in offsets.items()}
     return {
         name: offset

@@ -132,6 +132,19 @@ def test_droplets_tell_the_rest_and_where_there_are_none_it_stays_rough(cameras:
         assert alone["2"].votes == 0
 
 
+def test_cameras_that_are_known_roughly_do_not_move_the_clock_of_those_known_well(cameras: Cameras) -> None:
+    """Of two cameras droplets do not tell, and both are taken to be a tenth of a timestep late."""
+    droplets = Droplets(30, (TIMESTEPS + 12) * STEP, seed=3)
+    drops = {}
+    for name, camera in cameras.items():
+        off = 2.0 if name == "2" else 0.0
+        masks = [droplets.mask(camera, (t + off + 6) * STEP) for t in range(TIMESTEPS)]
+        drops[name] = droplets_of(masks, camera) if name in "234" else [np.zeros((0, 2))] * TIMESTEPS
+    found = clock_offsets(drops, cameras, DOWN, {"1": 0.1, "2": 2.0, "3": 0.0, "4": 0.0, "5": 0.15})
+    assert set(found) == {"2"}
+    assert found["2"].timesteps == pytest.approx(2.0, abs=0.04)
+
+
 def test_droplets_that_contradict_all_other_liquid_have_no_say(cameras: Cameras) -> None:
     """Votes for an offset of one timestep, while what else there is says none."""
     droplets = Droplets(30, TIMESTEPS * STEP, seed=3)
