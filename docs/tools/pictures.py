@@ -322,8 +322,8 @@ def perturbations() -> list[Path]:
     made(folder, "synth", "scene", "opaque_bowl", str(folder), "--size", "360x240", "--timesteps", "24")
     scene = Scene.open(folder)
     given = recording_of(scene)
-    figure = Figure(figsize=(12, 9.6), layout="constrained")
-    panels = iter(figure.subplots(5, 6).flat)
+    figure = Figure(figsize=(15, 6.8), layout="constrained")
+    panels = iter(figure.subplots(4, 8).flat)
     # What is missing or stated wrongly is in no photograph.
     unseen = MissingCameras.__module__, FewerTimesteps.__module__
     for kind in (None, *(kind for kind in KINDS if kind.__module__ not in unseen)):
@@ -334,6 +334,8 @@ def perturbations() -> list[Path]:
         outline = ndimage.binary_dilation(worse.mask(name, t)) ^ worse.mask(name, t)
         image[outline] = (230, 159, 0)
         bare(next(panels), title).imshow(image[20:190, 80:290])
+    for left in panels:
+        left.axis("off")
     return [store(figure, "perturbations.png", 100)]
 
 
