@@ -100,12 +100,11 @@ class _Carver:
     ) -> None:
         self._camera = silhouettes.cameras[view]
         self._occlusion = container.views[view] if container is not None and container.views else None
-        window = silhouettes.windows[view] if container is None else container.windows[view]
         if self._occlusion is not None:
-            window = self._occlusion.window
-        self._corner, self._evidence = window.corner, distance(view, window)
-        if self._occlusion is not None:
-            self._evidence = self._occlusion.evidence(self._evidence)
+            self._evidence = self._occlusion.evidence(distance(view, self._occlusion.window))
+        else:
+            window = silhouettes.windows[view] if container is None else container.windows[view]
+            self._corner, self._evidence = window.corner, distance(view, window)
 
     def carve(self, phi: np.ndarray, grid: Grid, blocks: np.ndarray | None = None) -> None:
         """phi = max(phi, that), in place, in voxels of `grid`, in `blocks` (see `carve_view`)."""
@@ -203,7 +202,12 @@ def sequence_bounds(
     for _ in range(3):
         grid = Grid.over(bounds, SEARCH_CELLS)
         carving = CarvingOcclusion.of(container, silhouettes, grid)
-        common = _inside(carve(silhouettes, grid, silhouettes.sequence_distance, carving), grid, tolerance=1.0)
+        if silhouettes.all_there:
+            allowed = carve(silhouettes, grid, silhouettes.sequence_distance, carving)
+        else:
+            # What a view ever sees says nothing of the times at which it was not there.
+            allowed, _ = _over_time(silhouettes, grid, carving)
+        common = _inside(allowed, grid, tolerance=1.0)
         if common is None:
             where = "" if container is None else ", and that the container is at the liquid (container_pose, gravity)"
             raise SplashbenchError(
@@ -215,12 +219,7 @@ def sequence_bounds(
         return bounds
     grid = Grid.over(bounds.padded(0.02), REFINED_CELLS)
     carving = CarvingOcclusion.of(container, silhouettes, grid)
-    nearest = np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
-    frames = np.zeros(grid.shape, dtype=np.int16)
-    for t in range(silhouettes.n_frames):
-        phi = carve_frame(silhouettes, grid, t, carving)
-        np.minimum(nearest, phi, out=nearest)
-        frames += phi < _NEAR
+    nearest, frames = _over_time(silhouettes, grid, carving)
     # Streams thinner than a voxel may fall between the nodes, hence the tolerance.
     refined = _inside(nearest, grid, tolerance=_NEAR)
     if refined is None or not any(silhouettes.cut_off):
@@ -232,6 +231,18 @@ def sequence_bounds(
         np.maximum(nearest, -in_images(silhouettes.that_see_liquid, grid, 1.0, LIMIT_VOXELS)), grid, tolerance=_NEAR
     )
     return most if in_all is None else most.joined(in_all)
+
+
+def _over_time(silhouettes: Silhouettes, grid: Grid, carving: CarvingOcclusion | None) -> tuple[np.ndarray, np.ndarray]:
+    """The least hull distance of all frames at each node of `grid`, float32 voxels; and in how many frames it is at
+    liquid, int32."""
+    nearest = np.full(grid.shape, LIMIT_VOXELS, dtype=np.float32)
+    frames = np.zeros(grid.shape, dtype=np.int32)
+    for t in range(silhouettes.n_frames):
+        phi = carve_frame(silhouettes, grid, t, carving)
+        np.minimum(nearest, phi, out=nearest)
+        frames += phi < _NEAR
+    return nearest, frames
 
 
 def _without_fringe(frames: np.ndarray, grid: Grid) -> Bounds:

@@ -118,6 +118,11 @@ class Silhouettes:
         self.failed_masks |= masks & self._enough[:, None]
 
     @property
+    def all_there(self) -> bool:
+        """Whether every view took photographs at about the time of every frame."""
+        return not self._absent.any()
+
+    @property
     def that_see_liquid(self) -> list[tuple[Camera, CutOff | None]]:
         """The cameras whose masks show any liquid, and what their images cut off."""
         return [(self.cameras[view], self.cut_off[view]) for view in np.flatnonzero(self.sees_liquid.any(axis=0))]
@@ -204,12 +209,7 @@ class Silhouettes:
         return self.evidence_mask(view, first) if share == 0 else self.distance(view, t) < 0
 
     def sequence_distance(self, view: int, window: ImageWindow | None = None) -> np.ndarray:
-        """2-D signed distance to everything that view number `view` ever sees as liquid, of `window`.
-
-        A view that was not there all the time says nothing of that.
-        """
-        if self._absent[:, view].any():
-            return self._no_evidence(view, window)
+        """2-D signed distance to everything that view number `view` ever sees as liquid, of `window`."""
         return self._distance(view, self.sequence_mask(view), window, 0, self.n_frames - 1)
 
     def certain_distance(self, view: int, t: int, window: ImageWindow | None = None) -> np.ndarray:

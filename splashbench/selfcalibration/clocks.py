@@ -90,18 +90,20 @@ def clock_offsets(
     """
     roughly = roughly or {}
     known = bool(roughly)
+    middle = _middle(roughly)
     # Whole timesteps are taken out beforehand.
-    whole = {name: round(roughly.get(name, 0.0) - _middle(roughly)) for name in droplets}
+    whole = {name: round(roughly[name] - middle) if name in roughly else 0 for name in droplets}
     shifted = {name: _shifted(drops, whole[name]) for name, drops in droplets.items()}
-    rest = {name: value - _middle(roughly) - whole[name] for name, value in roughly.items()}
+    rest = {name: value - middle - whole[name] for name, value in roughly.items()}
     found = _by_droplets(shifted, cameras, down, NEAR_REACH if known else REACH)
     if known:
         # What droplets say of a camera otherwise than all liquid does is a mistake.
         between = {name: offset.timesteps - rest[name] for name, offset in found.items() if name in rest}
         gauge = float(np.median(list(between.values()))) if between else 0.0
-        found = {name: found[name] for name, away in between.items() if abs(away - gauge) <= _ROUGHLY_SAME}
-        left = {name: Offset(value + gauge) for name, value in rest.items() if name not in found}
-        found = {**found, **left}
+        found = {
+            name: offset for name, offset in found.items() if abs(between.get(name, gauge) - gauge) <= _ROUGHLY_SAME
+        }
+        found = {**{name: Offset(value + gauge) for name, value in rest.items()}, **found}
     offsets = {name: replace(offset, timesteps=offset.timesteps + whole[name]) for name, offset in found.items()}
     if len(offsets) < _LEAST_CAMERAS:
         return {}

@@ -1,4 +1,4 @@
-"""How far the training cameras' clocks are apart, by how thick liquid is: told from masks, to a fifth of a timestep.
+"""How far the training cameras' clocks are apart, by how thick liquid is: told from masks, to a third of a timestep.
 
 A plane through the line between two cameras is a line in either image (an epipolar plane). Whatever liquid is in the
 plane, both cameras see it on their lines at the same time. How much they see is not the same, as they look from other

@@ -158,6 +158,21 @@ def test_a_camera_is_no_witness_of_times_before_it_started_and_after_it_stopped(
     assert all(Silhouettes(scene).trusted(1, t) for t in range(9))
 
 
+def test_cameras_that_were_all_away_at_some_time_leave_the_box_as_small() -> None:
+    """No view saw all of the ball's way, and every frame was seen by three of six at the least."""
+    scene = MovingBall(views=6)
+    for view, late in zip(scene.train, (2.0, -2.0, 1.0, -1.0, 2.0, -2.0)):
+        scene.camera_times[view] = scene.times + late
+    silhouettes = Silhouettes(scene)
+    assert not silhouettes.all_there
+    assert not any(all(silhouettes.trusted(view, t) for t in range(9)) for view in range(6))
+    exact, found = sequence_bounds(MovingBall(views=6)), sequence_bounds(silhouettes)
+    # In its first and last frames fewer views end the ball.
+    assert (found.high - found.low < 1.6 * (exact.high - exact.low)).all()
+    assert (found.low <= exact.low + 0.03).all()
+    assert (found.high >= exact.high - 0.03).all()
+
+
 def test_masks_between_which_a_time_lies_are_trusted_together() -> None:
     scene = MovingBall()
     scene.camera_times["1"] = scene.times + 0.4

@@ -145,6 +145,19 @@ def test_cameras_that_are_known_roughly_do_not_move_the_clock_of_those_known_wel
     assert found["2"].timesteps == pytest.approx(2.0, abs=0.04)
 
 
+def test_a_camera_that_is_not_known_roughly_is_told_by_its_droplets(cameras: Cameras) -> None:
+    """It starts from its clock as told, however far the others are off."""
+    droplets = Droplets(30, (TIMESTEPS + 12) * STEP, seed=3)
+    late = {"1": 0.6, "2": -4.0}
+    drops = {
+        name: droplets_of([droplets.mask(c, (t + late.get(name, 0.0) + 6) * STEP) for t in range(TIMESTEPS)], c)
+        for name, c in cameras.items()
+    }
+    # Offsets whose common part is anything.
+    found = clock_offsets(drops, cameras, DOWN, {"2": -1.0, "3": 3.0, "4": 3.0, "5": 3.0})
+    assert {name: offset.timesteps for name, offset in found.items()} == pytest.approx(late, abs=0.05)
+
+
 def test_droplets_that_contradict_all_other_liquid_have_no_say(cameras: Cameras) -> None:
     """Votes for an offset of one timestep, while what else there is says none."""
     droplets = Droplets(30, TIMESTEPS * STEP, seed=3)

@@ -36,7 +36,7 @@ _STEADY = 3
 # Above its top a jet is no slower than this share of its speed there.
 _SLOWEST = 0.2
 # Beads tell a speed where thickness agrees between frames by so much more (correlation) than at most speeds. Two smooth
-# jets agree by .05 more at the most, four beaded ones by .35 to .5.
+# jets agree by .05 more at the most, four beaded ones by .38 to .69.
 _BEADED = 0.2
 # And by so many standard deviations of what chance has.
 _CHANCE = 4.0
@@ -181,7 +181,7 @@ def fit_jets(frames: list[Slices], times: np.ndarray, gravity: float, voxel: flo
     usual = np.nanmedian(agreement) if np.isfinite(agreement).any() else np.nan
     if agreement[clearest] - usual >= max(_BEADED, chance):
         finer = near[clearest] * _FINER
-        speed = float(finer[np.nanargmax([beads.agreement(one)[0] for one in finer])])
+        speed = float(finer[np.argmax(np.nan_to_num([beads.agreement(one)[0] for one in finer]))])
         _, _, paths = _explained(streams, ends, speed, top, gravity, voxel)
     elif speed in (speeds[0], speeds[-1]):  # nothing bends, thins or falls: any speed will do
         return [None] * len(frames)
