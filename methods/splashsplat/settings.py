@@ -38,7 +38,7 @@ Transmission = Literal["measured", "always", "never"]
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "35"
+VERSION = "36"
 
 
 class SplashSplatConfig(MethodConfig):

@@ -8,7 +8,8 @@ iterated reweighting). Test cameras are not looked at, and stay.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,8 @@ from scipy.spatial.transform import Rotation
 from splashbench.scene import Camera
 
 from .features import Tracks
+from .landmarks import Landmarks
+from .stacked import StackedCameras
 
 # Points below which cameras are left as told: of all, and in each view that is changed.
 _LEAST_POINTS, _LEAST_OF_A_VIEW = 60, 15
@@ -33,8 +36,10 @@ _FINEST = 0.05
 _SMALL = 0.05
 # Rounds of reweighting, evaluations in each, and the step of derivatives in pixels.
 _ROUNDS, _STEPS, _STEP = 4, 8, 1e-4
-# What changes cost, against the points' errors.
-_PRIOR = 0.1
+# What changes cost, against the points' errors; and where landmarks leave less open.
+_PRIOR, _PRIOR_HELD = 0.1, 0.01
+# Landmarks that typical points are further beside are none of this place, in pixels of an image of 240.
+_ELSEWHERE = 2.0
 # Cameras are right where a typical point is off by less, in pixels of an image of 240; and they are changed only where
 # points that had no say in it are off by this share at most, afterwards.
 _RIGHT, _BETTER = 0.12, 0.7
@@ -70,39 +75,8 @@ class FittedCameras:
 def reprojection(tracks: Tracks, cameras: Mapping[str, Camera], k1: float = 0.0) -> NDArray[np.float64]:
     """Reprojection errors [N, V, 2] in pixels of the points of `tracks`, each placed where the rays of its views meet
     best; NaN where a view shows none."""
-    pixels, seen = tracks.pixels, tracks.seen
-    centers = np.stack([cameras[name].center for name in tracks.views])
-    rays = np.full((*pixels.shape[:2], 3), np.nan)
-    for number, name in enumerate(tracks.views):
-        camera = cameras[name]
-        straight = _straight(camera, pixels[:, number], k1)
-        rays[:, number] = straight @ camera.w2c[:3, :3]
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    across = np.where(seen[..., None, None], np.eye(3) - rays[..., :, None] * rays[..., None, :], 0)
-    right = np.einsum("nvij,vj->ni", across, centers)
-    points = np.linalg.solve(across.sum(axis=1) + 1e-12 * np.eye(3), right[..., None])[..., 0]
-    errors = np.full(pixels.shape, np.nan)
-    for number, name in enumerate(tracks.views):
-        errors[:, number] = _seen_at(cameras[name], points, k1) - pixels[:, number]
-    return errors
-
-
-def _straight(camera: Camera, pixels: NDArray[np.float64], k1: float) -> NDArray[np.float64]:
-    """Rays [N, 3] of `pixels` in the camera's frame, without the distortion k1."""
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(camera.K).T
-    bent = rays[:, :2]
-    straight = bent.copy()
-    for _ in range(8 if k1 else 0):
-        straight = bent / (1 + k1 * (straight**2).sum(axis=1, keepdims=True))
-    return np.concatenate([straight, rays[:, 2:]], axis=1)
-
-
-def _seen_at(camera: Camera, points: NDArray[np.float64], k1: float) -> NDArray[np.float64]:
-    """Pixels [N, 2] of `points`, with the distortion k1."""
-    local = points @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
-    flat = local[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:])
-    flat = flat * (1 + k1 * (flat**2).sum(axis=1, keepdims=True))
-    return np.asarray(flat @ camera.K[:2, :2].T + camera.K[:2, 2])
+    stack = StackedCameras.of(cameras, tracks.views, k1)
+    return stack.errors(tracks, stack.placed(tracks))
 
 
 # Of each camera: turn (3), move (3), focal length (1), principal point (2); and k1 of all.
@@ -130,17 +104,47 @@ _ANSWERS: tuple[tuple[str, ...], ...] = (
 class _Problem:
     """The unknowns, each in pixels at the image, and what they make of the cameras as told."""
 
-    def __init__(self, tracks: Tracks, told: Mapping[str, Camera]) -> None:
-        self.tracks, self.told = tracks, told
-        self.depth = _depths(tracks, told)
+    def __init__(self, tracks: Tracks, told: Mapping[str, Camera], landmarks: Landmarks | None) -> None:
+        self.tracks, self.told, self.landmarks = tracks, told, landmarks
         self.count = _OF_A_CAMERA * len(tracks.views) + 1
+        self._stacked = StackedCameras.of(told, tracks.views)
+        self._depth = _depths(self._stacked)
+        self._half = np.array([[0.5 * max(told[name].width, told[name].height)] for name in tracks.views])
+
+    def with_tracks(self, tracks: Tracks) -> _Problem:
+        """The same unknowns, of other tracks of the same views."""
+        other = copy(self)
+        other.tracks = tracks
+        return other
+
+    def stack(self, values: NDArray[np.float64]) -> StackedCameras:
+        """What `values` [..., count] make of the cameras."""
+        of_cameras = values[..., :-1].reshape(*values.shape[:-1], len(self.tracks.views), _OF_A_CAMERA)
+        turn, move, focal, point = np.split(of_cameras, (3, 6, 7), axis=-1)
+        told, pixel = self._stacked, 1 / self._stacked.K[:, 0, 0]
+        K = np.broadcast_to(told.K, (*of_cameras.shape[:-1], 3, 3)).copy()
+        # Never below 0, wherever the search goes.
+        K[..., [0, 1], [0, 1]] *= np.exp(np.clip(focal / self._half, -1, 1))
+        K[..., :2, 2] += point
+        turned = Rotation.from_rotvec((turn * pixel[:, None]).reshape(-1, 3)).as_matrix()
+        R = turned.reshape(*turn.shape[:-1], 3, 3) @ told.R
+        centers = told.centers + move * (self._depth * pixel)[:, None]
+        return StackedCameras(K, R, centers, values[..., -1] * self._bend)
 
     def cameras(self, values: NDArray[np.float64]) -> tuple[dict[str, Camera], float]:
-        found = {}
+        """The cameras, and k1 of all, that `values` [count] make."""
+        stack, found = self.stack(values), {}
         for number, name in enumerate(self.tracks.views):
-            turn, move, focal, point = np.split(values[_OF_A_CAMERA * number : _OF_A_CAMERA * (number + 1)], (3, 6, 7))
-            found[name] = self._changed(self.told[name], self.depth[name], turn, move, float(focal[0]), point)
-        return found, float(values[-1]) * self._bend
+            w2c = self.told[name].w2c.copy()
+            w2c[:3, :3], w2c[:3, 3] = stack.R[number], -stack.R[number] @ stack.centers[number]
+            found[name] = replace(self.told[name], K=stack.K[number], w2c=w2c)
+        return found, float(stack.k1)
+
+    def pixels_per_unit(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How many pixels a scene unit at `points` [N, 3] is in the views that show them, on average, [N]."""
+        far = np.linalg.norm(points[:, None] - self._stacked.centers, axis=-1)
+        pixels, seen = self._stacked.K[:, 0, 0] / np.maximum(far, 1e-9), self.tracks.seen
+        return np.asarray((pixels * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
 
     @property
     def _bend(self) -> float:
@@ -149,25 +153,6 @@ class _Problem:
         radius = 0.5 * max(camera.width, camera.height) / camera.K[0, 0]
         return float(1 / (camera.K[0, 0] * radius**3))
 
-    @staticmethod
-    def _changed(
-        camera: Camera,
-        depth: float,
-        turn: NDArray[np.float64],
-        move: NDArray[np.float64],
-        focal: float,
-        point: NDArray[np.float64],
-    ) -> Camera:
-        pixel = 1 / camera.K[0, 0]
-        K = camera.K.copy()
-        # Never below 0, wherever the search goes.
-        K[[0, 1], [0, 1]] *= np.exp(np.clip(focal / (0.5 * max(camera.width, camera.height)), -1, 1))
-        K[:2, 2] += point
-        w2c = camera.w2c.copy()
-        w2c[:3, :3] = Rotation.from_rotvec(turn * pixel).as_matrix() @ camera.w2c[:3, :3]
-        w2c[:3, 3] = -w2c[:3, :3] @ (camera.center + move * depth * pixel)
-        return replace(camera, K=K, w2c=w2c)
-
     def groups(self, kinds: Collection[str]) -> list[NDArray[np.intp]]:
         """The unknowns of `kinds` that change together, of each camera; "bent" is that of all."""
         views = range(len(self.tracks.views))
@@ -175,13 +160,12 @@ class _Problem:
         return found + ([np.array([self.count - 1])] if "bent" in kinds else [])
 
 
-def _depths(tracks: Tracks, cameras: Mapping[str, Camera]) -> dict[str, float]:
-    """How far what the views look at is from each, about: where the middle rays meet."""
-    axes = np.stack([cameras[name].w2c[2, :3] for name in tracks.views])
-    centers = np.stack([cameras[name].center for name in tracks.views])
+def _depths(cameras: StackedCameras) -> NDArray[np.float64]:
+    """How far what the views look at is from each [V], about: where the middle rays meet."""
+    axes = cameras.R[:, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("vij,vj->i", across, centers), rcond=None)[0]
-    return {name: max(float(np.linalg.norm(middle - cameras[name].center)), 1e-6) for name in tracks.views}
+    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("vij,vj->i", across, cameras.centers), rcond=None)[0]
+    return np.maximum(np.linalg.norm(middle - cameras.centers, axis=1), 1e-6)
 
 
 def typical_error(tracks: Tracks, cameras: Mapping[str, Camera], k1: float = 0.0) -> float:
@@ -198,10 +182,18 @@ def _selected(tracks: Tracks) -> Tracks:
     return tracks.kept(np.unique(np.concatenate([order[: 2 * _MOST_POINTS], *of_each])))
 
 
-def fit_cameras(tracks: Tracks, told: Mapping[str, Camera]) -> FittedCameras | None:
+def fit_cameras(
+    tracks: Tracks,
+    told: Mapping[str, Camera],
+    sparse_points: NDArray[np.floating] | None = None,
+    again: Callable[[Mapping[str, Camera]], Tracks] | None = None,
+) -> FittedCameras | None:
     """The cameras that explain `tracks`, or None where there are too few points, or where cameras are right as told.
 
-    Every other point has no say, and tells whether the others are better explained for it.
+    Every other point has no say, and tells whether the others are better explained for it. sparse_points: [N, 3 or
+    more], of the still surroundings: they say where the world is, where points leave open whether it turned
+    (landmarks.py). again: finds the tracks that given cameras allow. Cameras that were told wrong hide some; once it is
+    known how they are wrong, all points have a say.
     """
     if len(tracks) < 2 * _LEAST_POINTS:
         return None
@@ -211,41 +203,110 @@ def fit_cameras(tracks: Tracks, told: Mapping[str, Camera]) -> FittedCameras | N
     before = typical_error(asked, told)
     if not np.isfinite(before) or before < _RIGHT * scale:
         return None
-    problem = _Problem(heard, told)
-    answers: list[tuple[float, dict[str, Camera], float, tuple[str, ...]]] = []
-    for kinds in _ANSWERS:
-        cameras, k1 = problem.cameras(_fitted(problem, problem.groups(kinds), scale))
-        answers.append((float(np.nan_to_num(typical_error(asked, cameras, k1), nan=np.inf)), cameras, k1, kinds))
-    best = min(answer[0] for answer in answers)
-    as_good = _AS_GOOD * best + _AS_GOOD_PIXELS * scale
-    after, cameras, k1, kinds = next(answer for answer in answers if answer[0] <= as_good)
-    if not after < _BETTER * before:
+    problem = _Problem(heard, told, Landmarks.of(sparse_points))
+    answer = _answer(problem, asked, scale)
+    if problem.landmarks is not None and not _lie_on(problem, answer.values) < _ELSEWHERE * scale:
+        problem.landmarks = None  # they are of another place, or in another frame
+        answer = _answer(problem, asked, scale)
+    if not answer.error < _BETTER * before:
         return None
+    values = answer.values
+    if again is not None:
+        whole = problem.with_tracks(again(problem.cameras(values)[0]))
+        finer = _fitted(whole, whole.groups(answer.kinds), scale, values)
+        if typical_error(asked, *problem.cameras(finer)) <= answer.as_good:
+            values = finer
+    cameras, k1 = problem.cameras(values)
     few = [name for number, name in enumerate(tracks.views) if heard.seen[:, number].sum() < _LEAST_OF_A_VIEW]
-    return FittedCameras(cameras | {name: told[name] for name in few}, k1, kinds, before, after, len(tracks))
+    right = cameras | {name: told[name] for name in few}
+    return FittedCameras(right, k1, answer.kinds, before, answer.error, len(tracks))
 
 
-def _fitted(problem: _Problem, groups: list[NDArray[np.intp]], scale: float) -> NDArray[np.float64]:
-    """The unknowns, of which those in `groups` are free."""
-    values, free = np.zeros(problem.count), np.concatenate(groups)
+@dataclass(frozen=True)
+class _Answer:
+    """The unknowns when `kinds` are free. error: the `typical_error` of points that had no say. as_good: up to which
+    others are as good."""
+
+    error: float
+    values: NDArray[np.float64]
+    kinds: tuple[str, ...]
+    as_good: float = np.inf
+
+
+def _answer(problem: _Problem, asked: Tracks, scale: float) -> _Answer:
+    """The first of `_ANSWERS` that is as good as any, by the points `asked`."""
+    answers = []
+    for kinds in _ANSWERS:
+        values = _fitted(problem, problem.groups(kinds), scale)
+        error = typical_error(asked, *problem.cameras(values))
+        answers.append(_Answer(float(np.nan_to_num(error, nan=np.inf)), values, kinds))
+    as_good = _AS_GOOD * min(answer.error for answer in answers) + _AS_GOOD_PIXELS * scale
+    return replace(next(answer for answer in answers if answer.error <= as_good), as_good=as_good)
+
+
+def _lie_on(problem: _Problem, values: NDArray[np.float64]) -> float:
+    """How far in pixels a typical point is beside the problem's landmarks; infinite where there is none."""
+    landmarks = problem.landmarks
+    assert landmarks is not None
+    points = problem.stack(values).placed(problem.tracks)
+    planes = landmarks.nearest(points)
+    off = np.abs(landmarks.off(points, planes)) * problem.pixels_per_unit(points)
+    return float(np.median(off[planes >= 0])) if (planes >= 0).any() else np.inf
+
+
+def _fitted(
+    problem: _Problem, groups: list[NDArray[np.intp]], scale: float, start: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """The unknowns, of which those in `groups` are free; from `start` on."""
+    values, free = np.zeros(problem.count) if start is None else start.copy(), np.concatenate(groups)
     seen = problem.tracks.seen
+    of_prior = _PRIOR if problem.landmarks is None else _PRIOR_HELD
     for _ in range(_ROUNDS):
-        lengths = np.linalg.norm(reprojection(problem.tracks, *problem.cameras(values)), axis=-1)[seen]
+        stack = problem.stack(values)
+        points = stack.placed(problem.tracks)
+        lengths = np.linalg.norm(stack.errors(problem.tracks, points), axis=-1)[seen]
         spread = max(float(np.median(np.nan_to_num(lengths))), 0.02 * scale)
         bound = _OUTLIER * spread
         prior = np.zeros(problem.count)
         for group in groups:
             # The larger a change is, the less a pixel of it costs: a sum of sizes.
             prior[group] = min(spread, _FINEST * scale) / np.sqrt(np.linalg.norm(values[group]) / scale + _SMALL)
-        prior *= np.sqrt(_PRIOR * seen.sum() / len(groups))
+        prior *= np.sqrt(of_prior * seen.sum() / len(groups))
         prior[-1] = 0.0  # a bend of all lenses leaves nothing open
 
-        told = (problem, values, free, bound, prior[free] / scale)
+        held = None if problem.landmarks is None else _held(problem, problem.landmarks, points, spread)
+        told = (problem, values, free, bound, prior[free] / scale, held)
         # With derivatives of its own, as releases of SciPy differ in whether evaluations for them count.
         values[free] = least_squares(
             _residual, values[free], _slopes, method="lm", x_scale=1.0, max_nfev=_STEPS, args=told
         ).x
     return values
+
+
+@dataclass(frozen=True)
+class _Held:
+    """What landmarks say of points. planes: [N], of `landmarks`. weight: [N], of what a scene unit beside them costs in
+    pixels."""
+
+    landmarks: Landmarks
+    planes: NDArray[np.intp]
+    weight: NDArray[np.float64]
+
+    def errors(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far `points` [..., N, 3] are beside their planes, as pixels of reprojection count."""
+        return self.landmarks.off(points, self.planes) * self.weight
+
+
+def _held(problem: _Problem, landmarks: Landmarks, points: NDArray[np.float64], spread: float) -> _Held | None:
+    """What `landmarks` say of `points` [N, 3] that are seen to within `spread` pixels. A typical one counts as much as
+    a reprojection error that is typical, as nobody knows how true to surfaces sparse points are."""
+    planes = landmarks.nearest(points)
+    off = np.abs(landmarks.off(points, planes)) * problem.pixels_per_unit(points)
+    near = planes >= 0
+    if not near.any():
+        return None
+    typical = max(float(np.median(off[near])), spread)
+    return _Held(landmarks, planes, np.where(near, problem.pixels_per_unit(points) * spread / typical, 0.0))
 
 
 def _residual(
@@ -255,28 +316,34 @@ def _residual(
     free: NDArray[np.intp],
     bound: float,
     prior: NDArray[np.float64],
+    held: _Held | None,
 ) -> NDArray[np.float64]:
-    """What is left of points, by Cauchy's loss beyond `bound` pixels, and of the `prior` on what was `changed`."""
-    values = values.copy()
-    values[free] = changed
-    errors = reprojection(problem.tracks, *problem.cameras(values))[problem.tracks.seen]
+    """What is left of points, by Cauchy's loss beyond `bound` pixels, what landmarks say of them, likewise, and of the
+    `prior` on what was `changed` [..., F]: [..., M]."""
+    values = np.broadcast_to(values, (*changed.shape[:-1], len(values))).copy()
+    values[..., free] = changed
+    stack = problem.stack(values)
+    points = stack.placed(problem.tracks)
+    parts = [_damped(stack.errors(problem.tracks, points)[..., problem.tracks.seen, :], bound)]
+    if held is not None:
+        parts.append(_damped(held.errors(points)[..., None], bound))
+    flat = [part.reshape(*part.shape[:-2], -1) for part in parts]
+    return np.concatenate([*flat, prior * changed], axis=-1)
+
+
+def _damped(errors: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
+    """`errors` [..., N, D], each scaled to the root of its loss."""
     # Rays that never meet, as those of two cameras in one place, say nothing.
     errors = np.nan_to_num(errors, nan=0.0, posinf=0.0, neginf=0.0)
     lengths = np.linalg.norm(errors, axis=-1, keepdims=True)
-    # Each error scaled to the root of its loss.
-    damped = errors * bound * np.sqrt(np.log1p((lengths / bound) ** 2)) / np.maximum(lengths, 1e-12)
-    return np.concatenate([damped.ravel(), prior * changed])
+    return np.asarray(errors * bound * np.sqrt(np.log1p((lengths / bound) ** 2)) / np.maximum(lengths, 1e-12))
 
 
 def _slopes(changed: NDArray[np.float64], *told: Any) -> NDArray[np.float64]:
     """Derivatives of `_residual`, by forward differences."""
-    start = _residual(changed, *told)
-    slopes = np.empty((len(start), len(changed)))
-    for number in range(len(changed)):
-        beside = changed.copy()
-        beside[number] += _STEP
-        slopes[:, number] = (_residual(beside, *told) - start) / _STEP
-    return slopes
+    beside = changed + np.concatenate([np.zeros((1, len(changed))), _STEP * np.eye(len(changed))])
+    found = _residual(beside, *told)
+    return np.ascontiguousarray(((found[1:] - found[0]) / _STEP).T)
 
 
 def corrections(fitted: FittedCameras, told: Mapping[str, Camera]) -> dict[str, CameraCorrection]:

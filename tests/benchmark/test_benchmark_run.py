@@ -182,6 +182,7 @@ def test_killed_and_started_again_the_results_are_the_same(real: Path, tmp_path:
     assert len(list_files(out / "results").names) == 4
 
 
+@pytest.mark.slow
 def test_a_failed_run_keeps_its_row(real: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     words = ["benchmark", "run", str(out), "--scenes", str(real / "real_scene_crop" / "bowl_001")]

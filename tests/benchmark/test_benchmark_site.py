@@ -313,6 +313,7 @@ def test_an_entry_with_a_fault_is_named_and_left_out(
     assert "Left out" in (tmp_path / "site" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_submissions_are_scored_again_where_the_scenes_are(
     benchmark: Path, real: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

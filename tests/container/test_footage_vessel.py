@@ -109,6 +109,7 @@ def test_pixels_that_other_views_contradict_have_no_say(
     assert (min(covers(roughly, bowl(), speckled)) > 0.85) is told
 
 
+@pytest.mark.slow
 def test_a_box_is_found_too(tmp_path: Path) -> None:
     directory = write_painted_scene(tmp_path / "scene", SPECKLED, trough(), masked=False)
     found = standing(directory)
@@ -128,6 +129,7 @@ def test_what_holds_no_liquid_or_shows_no_depth_is_no_container(balls_directory:
         assert found.vessel is None or not found.vessel.trusted, directory
 
 
+@pytest.mark.slow
 def test_glass_is_found_about_liquid_that_rests_in_it(tmp_path: Path) -> None:
     directory = write_glass_scene(tmp_path / "glass")
     found = standing(directory)
@@ -195,6 +197,7 @@ def test_without_liquid_or_with_one_camera_there_is_nothing_to_look_for(balls_di
     assert (found.support, found.vessel) == (None, None)
 
 
+@pytest.mark.slow
 def test_gravity_that_is_stated_and_masks_that_failed(speckled: Path) -> None:
     scene = Scene.open(speckled).training()
     plates = make_clean_plates(scene)

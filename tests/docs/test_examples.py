@@ -58,6 +58,7 @@ def test_a_method_of_your_own(tmp_path: Path) -> None:
     assert result.value("miou") > 0.5
 
 
+@pytest.mark.slow
 def test_two_methods_compared(tmp_path: Path) -> None:
     files = example("compare_methods")(tmp_path, methods=("nearest_camera",))
     board = next(path for path in files if path.suffix == ".csv").read_text(encoding="utf-8")

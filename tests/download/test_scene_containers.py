@@ -159,6 +159,7 @@ def test_a_tank_that_may_be_transparent_is_one_line_with_the_command_to_do_it_by
     assert "is not unpacked: add --variant full crop" in line
 
 
+@pytest.mark.slow
 def test_stopped_and_killed_it_goes_on_and_ends_with_the_same_bytes(
     out: Path, placed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -69,6 +69,7 @@ def folders(make_result: Any, course: Any, tmp_path: Path) -> list[Path]:
     return [_make(make_result, course, tmp_path / f"results_{count}", count) for count in COUNTS]
 
 
+@pytest.mark.slow
 def test_work_grows_linearly_with_the_results(folders: list[Path], tmp_path: Path) -> None:
     _leaderboard(folders[0], tmp_path / "first")  # imports and caches
     measured = [_calls_and_seconds(partial(_leaderboard, folder, tmp_path / "out")) for folder in folders]

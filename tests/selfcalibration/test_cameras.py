@@ -14,7 +14,7 @@ from splashbench.scene import Camera
 from splashbench.selfcalibration.cameras import FittedCameras, corrections, fit_cameras, typical_error
 from splashbench.selfcalibration.features import Tracks, epipolar_distance, find_tracks
 
-from .conftest import SIZE, photograph, plate_of, turned
+from .conftest import HALF, SIZE, WALL, photograph, plate_of, turned
 
 Cameras = dict[str, Camera]
 
@@ -99,6 +99,48 @@ def test_lenses_that_bend_are_found(cameras: Cameras) -> None:
     assert found.distortion == pytest.approx(-0.2, abs=0.02)
     for name, camera in found.cameras.items():
         assert misplaced(camera, cameras[name]) < 0.05
+
+
+def sparse_points(rough: float = 0.0) -> NDArray[np.float64]:
+    """Sparse points [4000, 3] on table and wall, `rough` scene units beside them."""
+    rng = np.random.default_rng(5)
+    across = rng.uniform(-HALF, HALF, (4000, 2))
+    on_table = np.stack([across[:2000, 0], np.zeros(2000), np.maximum(across[:2000, 1], WALL)], axis=1)
+    on_wall = np.stack([across[2000:, 0], np.abs(across[2000:, 1]), np.full(2000, WALL)], axis=1)
+    return np.concatenate([on_table, on_wall]) + rng.normal(size=(4000, 3)) * rough
+
+
+def all_turned(cameras: Cameras, degrees: float) -> Cameras:
+    rng = np.random.default_rng(1)
+    return {name: turned(camera, degrees, tuple(rng.normal(size=3))) for name, camera in cameras.items()}
+
+
+@pytest.mark.parametrize("rough", [0.0, 0.01])
+def test_where_all_cameras_turned_sparse_points_hold_the_world(
+    plates: dict[str, CleanPlate], cameras: Cameras, rough: float
+) -> None:
+    """What cameras have in common is explained by other worlds, too."""
+    told = all_turned(cameras, 2.0)
+    tracks = find_tracks(plates, told)
+    found = fit_cameras(tracks, told, sparse_points(rough), lambda given: find_tracks(plates, given))
+    assert found is not None
+    assert found.kinds == ("turned",)
+    off = max(misplaced(camera, cameras[name]) for name, camera in found.cameras.items())
+    injected = max(misplaced(camera, cameras[name]) for name, camera in told.items())
+    assert injected > 5
+    assert off < 0.02 * injected
+    without = fitted(tracks, told)
+    assert off < 0.5 * max(misplaced(camera, cameras[name]) for name, camera in without.cameras.items())
+
+
+def test_sparse_points_of_another_place_are_not_believed(plates: dict[str, CleanPlate], cameras: Cameras) -> None:
+    told = cameras | {"2": turned(cameras["2"], 0.5)}
+    tracks = find_tracks(plates, told)
+    elsewhere = fit_cameras(tracks, told, 0.3 * sparse_points() + [0.2, 0.5, 0.1])
+    without = fitted(tracks, told)
+    assert elsewhere is not None
+    for name, camera in without.cameras.items():
+        np.testing.assert_array_equal(elsewhere.cameras[name].w2c, camera.w2c)
 
 
 def test_noise_has_nothing_in_common(cameras: Cameras) -> None:

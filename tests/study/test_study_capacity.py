@@ -88,6 +88,7 @@ def test_a_second_time_nothing_is_run(study: Path, balls_directory: Path, capsys
     assert list((study / "submissions").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_failed_rungs_are_rows_and_the_curve_goes_on_rising(balls_directory: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["study", "capacity", GROWING, str(out), "--scenes", str(balls_directory)]
@@ -102,6 +103,7 @@ def test_failed_rungs_are_rows_and_the_curve_goes_on_rising(balls_directory: Pat
     assert "Runs: 2 ok, 1 failed" in page
 
 
+@pytest.mark.slow
 def test_rungs_that_failed_above_a_knee_are_told(balls_directory: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["study", "capacity", GROWING, str(out), "--scenes", str(balls_directory), "--set", "fails_from=16"]

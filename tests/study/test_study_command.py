@@ -101,6 +101,7 @@ def test_results_are_a_leaderboard_s_and_renders_are_gone(study: tuple[str, Path
     assert list((out / "submissions").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_every_row_with_withheld_timesteps_has_its_own_renders_faded_beside_it(
     balls_directory: Path, tmp_path: Path
 ) -> None:

@@ -135,6 +135,7 @@ def test_timesteps_that_a_scene_cannot_do_without_are_left_out(balls_directory: 
     assert unseen == {None, "keep_1_of_2", "keep_1_of_6"}
 
 
+@pytest.mark.slow
 def test_runs_that_were_told_otherwise_are_made_again(balls_directory: Path, tmp_path: Path) -> None:
     """Container masks that come later are hints which no digest is of."""
     scene, out = Path(shutil.copytree(balls_directory, tmp_path / "balls")), tmp_path / "out"

@@ -71,6 +71,7 @@ def test_less_than_nothing_fits_into_is_still_a_model(balls: Scene, tmp_path: Pa
     assert np.isfinite(SplashSplat().load(tmp_path, balls.training()).render(camera, time).rgb).all()
 
 
+@pytest.mark.slow
 def test_seconds_choose_the_grids_by_how_long_the_draft_took(balls: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     cells = []
     for seconds in (1.0, 600.0):

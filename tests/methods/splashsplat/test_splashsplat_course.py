@@ -366,6 +366,7 @@ def test_there_is_none_where_something_else_ends_the_fit(
     assert coarse_fits == []
 
 
+@pytest.mark.slow
 def test_a_draft_of_large_photographs_sees_small_ones_and_the_fit_is_the_same(
     balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

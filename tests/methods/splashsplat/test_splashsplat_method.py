@@ -85,6 +85,7 @@ np.savez({str(tmp_path / "views.npz")!r}, rgb=[v.rgb for v in views], alpha=[v.a
     assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} <= {".json", ".npz"}
 
 
+@pytest.mark.slow
 def test_drawn_together_with_the_background_it_is_saved_and_loaded_too(balls: Scene, tmp_path: Path):
     """As in the preset paper: one rasterisation of all Gaussians, in the fit and in what it renders."""
     settings = TINY | {"iterations": 60, "composition": "together", "silhouette_norm": "image", "children": 2}

@@ -139,6 +139,7 @@ def test_a_scene_that_is_soon_explained_is_soon_fitted(many_balls: Scene, monkey
     assert len(fitted(many_balls, iterations=60, validation_share=0.0)) == 60
 
 
+@pytest.mark.slow
 def test_withheld_photographs_are_fitted_once_the_rates_fall(many_balls: Scene, monkeypatch: pytest.MonkeyPatch):
     """All photographs but the withheld ones in the first part, all of them in the second."""
     seen: list[int] = []

@@ -134,6 +134,7 @@ def test_the_first_camera_is_named_where_it_saw_nothing() -> None:
         board_poses(sightings, truth.lenses)
 
 
+@pytest.mark.slow
 def test_cameras_joined_by_misread_boards_alone_are_refused() -> None:
     truth = rig(4, 60.0, 30)
     sightings = truth.sightings(np.random.default_rng(3))

@@ -324,6 +324,7 @@ def test_photographs_of_unknown_cameras_are_all_registered(test_data: Path, tmp_
         assert 0.5 < lens.focal / max(lens.width, lens.height) < 5
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_bits(capture: Capture, solved: Poses, tmp_path: Path) -> None:
     again = estimate_poses(capture.static, capture.lenses, capture.sweep, tmp_path)
     for camera in capture.w2c:
@@ -331,6 +332,7 @@ def test_the_same_images_give_the_same_bits(capture: Capture, solved: Poses, tmp
     np.testing.assert_array_equal(again.points, solved.points)
 
 
+@pytest.mark.slow
 def test_a_camera_without_matches_is_named(capture: Capture, tmp_path: Path) -> None:
     blank = np.full((HEIGHT, WIDTH, 3), 127, np.uint8)
     with pytest.raises(SplashbenchError, match="no pose for camera 3;"):
