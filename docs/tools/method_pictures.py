@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,14 @@ from splashbench.container.footage_vessel import standing_about_liquid
 from splashbench.container.mask_vessel import vessel_from_masks
 from splashbench.container.verification import overlay
 from splashbench.observe import Grid, Silhouettes, sequence_bounds, signed_distance_frames
-from splashbench.scene import Scene
+from splashbench.scene import Camera, Scene
 from splashbench.scene.scene import TrainingScene
+from splashbench.selfcalibration.cameras import fit_cameras
+from splashbench.selfcalibration.features import find_tracks
 from splashbench.selfcalibration.thickness import REACH, Thickness, agreement, courses
 from splashbench.selfcalibration.unmasked import outlines_by_change
 from splashbench.study.perturbations import Dice, Recording, perturbed
-from splashbench.study.perturbations.cameras import TightFraming
+from splashbench.study.perturbations.cameras import PoseRotation, TightFraming
 from splashbench.study.scenes import recording_of
 from splashbench.submission import Submission
 from splashbench_methods.splashsplat.fields.container import known_container
@@ -290,14 +293,7 @@ def cut_off() -> list[Path]:
         silhouettes = Silhouettes(_Pictures(tight))
         if has_a_say:
             silhouettes.cut_off = [None] * len(silhouettes.views)
-        grid = Grid.over(sequence_bounds(silhouettes).padded(0.1), 160)
-        phi = next(signed_distance_frames(silhouettes, grid, frames=[frame]))
-        places, _ = camera.project(grid.to_scene(np.argwhere(phi < 0)))
-        column, row = np.floor(places).astype(int).T
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        hull = np.zeros((camera.height, camera.width), dtype=bool)
-        hull[row[inside], column[inside]] = True
-        outlines.append(ndimage.binary_closing(hull, iterations=2))
+        outlines.append(_hull_seen(silhouettes, frame, camera))
     figure = Figure(figsize=(10, 2.5), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     bare(left, "a camera that frames too tightly").imshow(tight.image(name, frame))
@@ -309,6 +305,45 @@ def cut_off() -> list[Path]:
         bare(axes, title).imshow(scene.image(other, frame))
         axes.contour(hull, levels=[0.5], colors=[ORANGE], linewidths=1.2)
     return [store(figure, "method_cut_off.png", 120)]
+
+
+def turned() -> list[Path]:
+    """The hull as a test view sees it: by cameras that are all told turned, as points in common alone say that they
+    stand, and as sparse points say beside."""
+    scene = Scene.open(made(WORK / "told_nothing_small", *POUR, str(WORK / "told_nothing_small"), *SMALL))
+    training, frame, test = scene.training(), scene.n_frames * 3 // 5, scene.cameras[scene.test[0]]
+    told = perturbed(recording_of(scene, list(scene.train)), [PoseRotation(amount=2.0)], Dice(1, scene.name))
+    plates = {name: plate.without_beside() for name, plate in make_clean_plates(training).items()}
+    tracks = find_tracks(plates, told.cameras)
+    cameras: list[tuple[str, Mapping[str, Camera]]] = [("cameras as told, each turned by 2°", told.cameras)]
+    for title, points in (
+        ("by points that cameras have in common", None),
+        ("and by sparse points", scene.initial_points()),
+    ):
+        found = fit_cameras(tracks, told.cameras, points, lambda given: find_tracks(plates, given))
+        assert found is not None
+        cameras.append((title, found.cameras))
+    mask = scene.mask(test.name, frame)
+    crop = window(mask, 12)
+    figure = Figure(figsize=(10, 3.1), layout="constrained")
+    for axes, (title, given) in zip(figure.subplots(1, 3), cameras):
+        hull = _hull_seen(Silhouettes(_Pictures(told.with_cameras(lambda one, at=given: at[one.name]))), frame, test)
+        bare(axes, title).imshow(scene.image(test.name, frame)[crop])
+        axes.contour(mask[crop], levels=[0.5], colors=["white"], linewidths=1)
+        axes.contour(hull[crop], levels=[0.5], colors=[ORANGE], linewidths=1.2)
+    return [store(figure, "method_turned.png", 120)]
+
+
+def _hull_seen(silhouettes: Silhouettes, frame: int, camera: Camera) -> NDArray[np.bool_]:
+    """Where `camera` sees the hull of `frame`, [H, W]."""
+    grid = Grid.over(sequence_bounds(silhouettes).padded(0.1), 160)
+    phi = next(signed_distance_frames(silhouettes, grid, frames=[frame]))
+    places, _ = camera.project(grid.to_scene(np.argwhere(phi < 0)))
+    column, row = np.floor(places).astype(int).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    hull = np.zeros((camera.height, camera.width), dtype=bool)
+    hull[row[inside], column[inside]] = True
+    return np.asarray(ndimage.binary_closing(hull, iterations=2))
 
 
 class _Pictures:

@@ -215,6 +215,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "rims": method_pictures.rims,
     "clocks": method_pictures.clocks,
     "cut_off": method_pictures.cut_off,
+    "turned": method_pictures.turned,
     "transmission": method_pictures.transmission,
     "perturbations": perturbations,
     "tutorial": tutorial,
