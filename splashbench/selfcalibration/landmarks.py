@@ -23,11 +23,10 @@ _FEWEST, _MOST = 100, 50_000
 @dataclass(frozen=True)
 class Landmarks:
     """Planes through sparse points. places, normals: [M, 3], of each point the middle of those around it and the unit
-    vector across them. reach: [M], how far around it they lie. tree: of the places."""
+    vector across them. tree: of the places."""
 
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
-    reach: NDArray[np.float64]
     tree: KDTree
 
     @classmethod
@@ -35,20 +34,20 @@ class Landmarks:
         """Those of sparse `points` [N, 3 or more], or None where they are too few or lie on no surfaces."""
         if points is None:
             return None
-        known = np.unique(np.asarray(points, dtype=np.float64)[:, :3], axis=0)
+        known = np.asarray(points, dtype=np.float64)[:, :3]
         known = known[np.isfinite(known).all(axis=1)]
+        known = known[np.linspace(0, max(len(known) - 1, 0), min(len(known), _MOST)).round().astype(np.int64)]
+        known = np.unique(known, axis=0)
         if len(known) < _FEWEST:
             return None
-        known = known[np.linspace(0, len(known) - 1, min(len(known), _MOST)).round().astype(np.int64)]
-        far, around = KDTree(known).query(known, k=_AROUND)
-        patches = known[around]
+        patches = known[KDTree(known).query(known, k=_AROUND)[1]]
         middles = patches.mean(axis=1)
         spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patches - middles[:, None], patches - middles[:, None]))
         flat = spread[:, 1] > _FLAT**2 * np.maximum(spread[:, 0], 0)
         if flat.sum() < _FEWEST:
             return None
         middles = middles[flat]
-        return cls(middles, axes[flat, :, 0], far[flat, -1], KDTree(middles))
+        return cls(middles, axes[flat, :, 0], KDTree(middles))
 
     def nearest(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
         """The planes that `points` [N, 3] are nearest to, [N]; -1 where there is none."""

@@ -41,9 +41,11 @@ def test_what_lies_on_no_surface_says_nothing(points: NDArray[np.float64] | None
     assert Landmarks.of(points) is None
 
 
-def test_what_is_no_number_is_left_out() -> None:
+@pytest.mark.parametrize("value", [np.inf, np.nan, 3e38])
+def test_what_is_no_number_is_left_out(value: float) -> None:
+    """Or what no file can mean: the largest number of single precision."""
     points = plane(500)
-    points[::7, 0] = np.inf
+    points[::7, 0] = value
     landmarks = Landmarks.of(points)
     assert landmarks is not None
     assert np.isfinite(landmarks.places).all()
