@@ -225,3 +225,15 @@ def test_the_means_are_those_of_the_runs() -> None:
     means = runs.groupby(["method", "metric"]).retention.mean()
     names = [(method, metric) for method in METHODS for metric in ("miou", "psnr")]
     assert [float(figure) for figure in said.groups()] == pytest.approx([means[name] for name in names], abs=0.0051)
+
+
+def test_what_version_36_keeps_of_turned_rigs_is_what_was_run() -> None:
+    kept = pd.read_csv(RESULTS / "data" / "stability_version_36.csv").set_index(
+        ["scene", "version", "kind", "amount", "metric"]
+    )
+    table = rows("| kept of mIoU / of PSNR, before and after |")
+    assert len(table) == 4
+    for kind, amount, *cells in table:
+        size = float(amount.split()[0])
+        for (scene, version), cell in zip(((BOWL, 24), (BOWL, 36), (TANK, 26), (TANK, 36)), cells, strict=True):
+            holds(cell.replace("*", ""), kept.retention, scene, version, kind.strip("`"), size)
