@@ -106,6 +106,7 @@ def test_a_scan_tells_place_gravity_and_scale(
     assert read_image(tmp_path / "p.png").shape == (4 * 64, 2 * 96, 3)
 
 
+@pytest.mark.slow
 def test_what_scene_json_said_stays_and_a_container_is_replaced_on_demand(
     released: Path, scan: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -81,7 +81,7 @@ def test_a_rough_one_is_there_before_edges_are_looked_at(speckled: Path) -> None
     assert min(covers(roughly, bowl(), speckled)) > 0.75
 
 
-@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("told", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_pixels_that_other_views_contradict_have_no_say(
     speckled: Path, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

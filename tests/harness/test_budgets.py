@@ -60,6 +60,7 @@ def test_what_is_no_budget_is_a_usage_error(option: str, value: str, capsys: pyt
     assert option in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_budget_that_was_not_kept_is_said(
     thrifty: str, balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

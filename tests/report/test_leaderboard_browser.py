@@ -282,6 +282,7 @@ def test_strangers_names_are_shown_as_text(
     }
 
 
+@pytest.mark.slow
 def test_the_dark_page_is_dark_and_its_picture_is_not_empty(
     results: Path, browser: str, tmp_path: Path, page_of: PageOf
 ) -> None:

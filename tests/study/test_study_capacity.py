@@ -113,6 +113,7 @@ def test_rungs_that_failed_above_a_knee_are_told(balls_directory: Path, tmp_path
     assert "up to rung 3); 2 larger rungs have no figures." in page
 
 
+@pytest.mark.slow
 def test_training_views_that_a_model_cannot_show_are_told(balls_directory: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["study", "capacity", GROWING, str(out), "--scenes", str(balls_directory), "--ladder", "size=4,8"]

@@ -251,6 +251,7 @@ def test_two_halves_have_one_camera(fit: Path, balls_directory: Path) -> None:
         session.close()
 
 
+@pytest.mark.slow
 def test_a_screenshot_from_the_command_line(
     fit: Path, balls_directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,9 +85,18 @@ def test_models_that_are_not_what_they_seem(name: str, failed: dict[str, str]) -
     [
         ("Unseeded", SCENE, {"same_seed": "in a second fit with seed 0"}),
         ("Peeks", SCENE, {"hidden_test_views": "where they can be read", "unread_test_views": "ims/6/000000.png"}),
-        ("PeeksNatively", SCENE, {"hidden_test_views": "where they can be read", "unread_test_views": "ims/6/000000"}),
+        (
+            "PeeksNatively",
+            ["hidden_test_views", "unread_test_views"],
+            {"hidden_test_views": "where they can be read", "unread_test_views": "ims/6/000000"},
+        ),
         ("PeeksInVain", ["unread_test_views"], {"unread_test_views": "it looked into ims/6/000000.png"}),
-        ("PeeksNativelyInVain", ["unread_test_views"], {"unread_test_views": "it looked into ims/6/000000.png"}),
+        pytest.param(
+            "PeeksNativelyInVain",
+            ["unread_test_views"],
+            {"unread_test_views": "it looked into ims/6/000000.png"},
+            marks=pytest.mark.slow,
+        ),
         ("Lists", ["unread_test_views"], {"unread_test_views": "it looked into ims"}),
         (
             "PeeksWhenLoaded",

@@ -276,7 +276,7 @@ def test_opaque_liquid_is_shown_before_there_is_a_background(
     assert fine > 1.5 * coarse
 
 
-@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("cores", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_transparent_liquid_is_shown_before_the_background_first(
     cores: int, balls: Scene, short_background: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

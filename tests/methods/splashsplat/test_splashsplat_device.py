@@ -119,7 +119,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": ("paper", {"children": 2, "draft_cells": 0}),
 }
 #: What `make test` has time for: what most fits are, and how they are stored.
-_QUICK = ("best", "storing")
+_QUICK = ("storing",)
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,7 @@ def test_the_decoder_hands_colours_on_from_every_side(children: int) -> None:
     torch.testing.assert_close(decoder.mean_opacity(others), opacity)
 
 
+@pytest.mark.slow
 def test_a_draft_comes_first_where_states_are_taken_and_the_fit_is_the_same(balls: Scene, tmp_path: Path) -> None:
     scene, config = balls.training(), SplashSplatConfig.preset("quick", TINY | {"draft_cells": 32})
 

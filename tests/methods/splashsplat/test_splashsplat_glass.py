@@ -153,6 +153,7 @@ def in_glass(balls_copy: Path) -> Path:
     return balls_copy
 
 
+@pytest.mark.slow
 def test_only_liquid_in_a_transparent_container_has_glass_and_files_keep_it(in_glass: Path, tmp_path: Path) -> None:
     liquid = fitted(in_glass)
     glass = liquid.appearance.glass

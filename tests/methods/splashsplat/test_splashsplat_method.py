@@ -259,6 +259,7 @@ def test_photographs_of_before_the_first_and_after_the_last_timestep_teach_nothi
     assert len(collect_targets(training, grey, liquid.track, "window")) == 5 * balls.n_frames
 
 
+@pytest.mark.slow
 # Figures are within the masks, where the background hardly counts; it would take most of the time.
 @pytest.mark.usefixtures("short_background")
 def test_photographs_are_compared_with_the_liquid_at_their_cameras_own_times(tmp_path: Path):

@@ -291,6 +291,7 @@ def tracks(*names: str) -> Audio:
     return {name: (join_audio([folder / name], [0.0], RATE).samples, 0.0) for name in names}
 
 
+@pytest.mark.slow
 def test_real_recordings_of_speech_with_known_offsets() -> None:
     """BBC audio-offset-finder's excerpts; the third has white noise added and lacks 1105 samples of decoder delay."""
     audio = tracks("timbl_1.mp3", "timbl_2.mp3", "timbl_3.mp3", "r4_excerpt2.ogg")

@@ -209,7 +209,8 @@ def test_samples_lost_shortly_before_the_end_fail_the_gate_too() -> None:
     assert failed(clock) == {"clock_residual"}
 
 
-@pytest.mark.parametrize("seed", [pytest.param(11, marks=pytest.mark.slow), 13])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 13])
 def test_an_echo_that_a_window_catches_alone_fails_nothing(seed: int, tmp_path: Path) -> None:
     """By a table and a wall some windows end between a sound and its echo, and AAC leaves no noise that hides it."""
     plan = make_plan(RecordingOptions(fps=30, seed=seed, particle_radius=0.004))

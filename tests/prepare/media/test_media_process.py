@@ -205,6 +205,7 @@ def test_a_child_serves_whatever_thread_asks_and_no_process_that_is_forked_off(f
     assert (said.stdout, said.stderr) == ("9\n9\n", "")
 
 
+@pytest.mark.slow
 def test_memory_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small, large = write_film(tmp_path / "small.mp4"), write_film(tmp_path / "large.mp4", 3, (4096, 3072))
     # What the child takes before it decodes anything differs from machine to machine.
