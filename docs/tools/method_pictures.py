@@ -317,8 +317,8 @@ def turned() -> list[Path]:
     tracks = find_tracks(plates, told.cameras)
     cameras: list[tuple[str, Mapping[str, Camera]]] = [("cameras as told, each turned by 2°", told.cameras)]
     for title, points in (
-        ("by points that cameras have in common", None),
-        ("and by sparse points", scene.initial_points()),
+        ("by points that cameras have in common", lambda: None),
+        ("and by sparse points", scene.initial_points),
     ):
         found = fit_cameras(tracks, told.cameras, points, lambda given: find_tracks(plates, given))
         assert found is not None

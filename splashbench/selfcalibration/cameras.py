@@ -34,8 +34,11 @@ _OUTLIER = 3.0
 _FINEST = 0.05
 # Changes of a camera below so many pixels cost as their square, above as their size.
 _SMALL = 0.05
-# Rounds of reweighting, evaluations in each, and the step of derivatives in pixels.
-_ROUNDS, _STEPS, _STEP = 4, 8, 1e-4
+# Rounds of reweighting, and with landmarks, whose planes are looked up anew in each; evaluations in each; the step of
+# derivatives in pixels; and sights of points that are computed at once for these, which bounds the memory.
+_ROUNDS, _ROUNDS_HELD, _STEPS, _STEP, _AT_ONCE = 4, 8, 8, 1e-4, 500_000
+# Cameras stay as told where they change by no more than this share of what the most changed one does.
+_STAYS = 0.25
 # What changes cost, against the points' errors; and where landmarks leave less open.
 _PRIOR, _PRIOR_HELD = 0.1, 0.01
 # Landmarks that typical points are further beside are none of this place, in pixels of an image of 240.
@@ -104,8 +107,8 @@ _ANSWERS: tuple[tuple[str, ...], ...] = (
 class _Problem:
     """The unknowns, each in pixels at the image, and what they make of the cameras as told."""
 
-    def __init__(self, tracks: Tracks, told: Mapping[str, Camera], landmarks: Landmarks | None) -> None:
-        self.tracks, self.told, self.landmarks = tracks, told, landmarks
+    def __init__(self, tracks: Tracks, told: Mapping[str, Camera]) -> None:
+        self.tracks, self.told = tracks, told
         self.count = _OF_A_CAMERA * len(tracks.views) + 1
         self._stacked = StackedCameras.of(told, tracks.views)
         self._depth = _depths(self._stacked)
@@ -185,15 +188,15 @@ def _selected(tracks: Tracks) -> Tracks:
 def fit_cameras(
     tracks: Tracks,
     told: Mapping[str, Camera],
-    sparse_points: NDArray[np.floating] | None = None,
+    sparse_points: Callable[[], NDArray[np.floating] | None] = lambda: None,
     again: Callable[[Mapping[str, Camera]], Tracks] | None = None,
 ) -> FittedCameras | None:
     """The cameras that explain `tracks`, or None where there are too few points, or where cameras are right as told.
 
-    Every other point has no say, and tells whether the others are better explained for it. sparse_points: [N, 3 or
-    more], of the still surroundings: they say where the world is, where points leave open whether it turned
-    (landmarks.py). again: finds the tracks that given cameras allow. Cameras that were told wrong hide some; once it is
-    known how they are wrong, all points have a say.
+    Every other point has no say, and tells whether the others are better explained for it. sparse_points: gives those
+    of the still surroundings, [N, 3 or more]: they say where the world is (landmarks.py) where no cameras do that stay
+    as told. again: finds the tracks that given cameras allow. Cameras that were told wrong hide some; once it is known
+    how they are wrong, all points have a say.
     """
     if len(tracks) < 2 * _LEAST_POINTS:
         return None
@@ -203,65 +206,63 @@ def fit_cameras(
     before = typical_error(asked, told)
     if not np.isfinite(before) or before < _RIGHT * scale:
         return None
-    problem = _Problem(heard, told, Landmarks.of(sparse_points))
-    answer = _answer(problem, asked, scale)
-    if problem.landmarks is not None and not _lie_on(problem, answer.values) < _ELSEWHERE * scale:
-        problem.landmarks = None  # they are of another place, or in another frame
-        answer = _answer(problem, asked, scale)
-    if not answer.error < _BETTER * before:
-        return None
-    values = answer.values
-    if again is not None:
-        whole = problem.with_tracks(again(problem.cameras(values)[0]))
-        finer = _fitted(whole, whole.groups(answer.kinds), scale, values)
-        if typical_error(asked, *problem.cameras(finer)) <= answer.as_good:
-            values = finer
-    cameras, k1 = problem.cameras(values)
-    few = [name for number, name in enumerate(tracks.views) if heard.seen[:, number].sum() < _LEAST_OF_A_VIEW]
-    right = cameras | {name: told[name] for name in few}
-    return FittedCameras(right, k1, answer.kinds, before, answer.error, len(tracks))
-
-
-@dataclass(frozen=True)
-class _Answer:
-    """The unknowns when `kinds` are free. error: the `typical_error` of points that had no say. as_good: up to which
-    others are as good."""
-
-    error: float
-    values: NDArray[np.float64]
-    kinds: tuple[str, ...]
-    as_good: float = np.inf
-
-
-def _answer(problem: _Problem, asked: Tracks, scale: float) -> _Answer:
-    """The first of `_ANSWERS` that is as good as any, by the points `asked`."""
-    answers = []
+    problem = _Problem(heard, told)
+    answers: list[tuple[float, NDArray[np.float64], tuple[str, ...]]] = []
     for kinds in _ANSWERS:
         values = _fitted(problem, problem.groups(kinds), scale)
         error = typical_error(asked, *problem.cameras(values))
-        answers.append(_Answer(float(np.nan_to_num(error, nan=np.inf)), values, kinds))
-    as_good = _AS_GOOD * min(answer.error for answer in answers) + _AS_GOOD_PIXELS * scale
-    return replace(next(answer for answer in answers if answer.error <= as_good), as_good=as_good)
+        answers.append((float(np.nan_to_num(error, nan=np.inf)), values, kinds))
+    as_good = _AS_GOOD * min(answer[0] for answer in answers) + _AS_GOOD_PIXELS * scale
+    after, values, kinds = next(answer for answer in answers if answer[0] <= as_good)
+    if not after < _BETTER * before:
+        return None
+    whole = problem if again is None else problem.with_tracks(again(problem.cameras(values)[0]))
+    if len(whole.tracks) >= 2 * _LEAST_POINTS:
+        for landmarks in (None if _some_stay(problem, values) else Landmarks.of(sparse_points()), None):
+            finer = _fitted(whole, whole.groups(kinds), scale, values, landmarks)
+            # Landmarks that points are beside are of another place, or in another frame.
+            if landmarks is None or _typically_off(whole, landmarks, finer) < _ELSEWHERE * scale:
+                break
+        if typical_error(asked, *problem.cameras(finer)) <= as_good:
+            values = finer
+    cameras, k1 = problem.cameras(values)
+    few = [name for number, name in enumerate(tracks.views) if heard.seen[:, number].sum() < _LEAST_OF_A_VIEW]
+    return FittedCameras(cameras | {name: told[name] for name in few}, k1, kinds, before, after, len(tracks))
 
 
-def _lie_on(problem: _Problem, values: NDArray[np.float64]) -> float:
-    """How far in pixels a typical point is beside the problem's landmarks; infinite where there is none."""
-    landmarks = problem.landmarks
-    assert landmarks is not None
-    points = problem.stack(values).placed(problem.tracks)
-    planes = landmarks.nearest(points)
-    off = np.abs(landmarks.off(points, planes)) * problem.pixels_per_unit(points)
-    return float(np.median(off[planes >= 0])) if (planes >= 0).any() else np.inf
+def _some_stay(problem: _Problem, values: NDArray[np.float64]) -> bool:
+    """Whether most cameras are as told by `values`: then these say where the world is. Where all are wrong, changes
+    that are the least on the whole leave one or two at most, and none by much."""
+    changes = np.linalg.norm(values[:-1].reshape(-1, _OF_A_CAMERA), axis=1)
+    return bool(2 * (changes <= _STAYS * changes.max()).sum() > len(changes))
+
+
+def _beside(
+    problem: _Problem, landmarks: Landmarks, points: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
+    """The planes of `landmarks` that `points` [N, 3] belong to [N], how many pixels a scene unit is there [N], and how
+    many a typical point is beside its plane: infinite where there is none."""
+    planes, pixels = landmarks.nearest(points), problem.pixels_per_unit(points)
+    off = np.abs(landmarks.off(points, planes) * pixels)[planes >= 0]
+    return planes, pixels, float(np.median(off)) if len(off) else np.inf
+
+
+def _typically_off(problem: _Problem, landmarks: Landmarks, values: NDArray[np.float64]) -> float:
+    """How far in pixels a typical point is beside `landmarks`, with the cameras that `values` make."""
+    return _beside(problem, landmarks, problem.stack(values).placed(problem.tracks))[2]
 
 
 def _fitted(
-    problem: _Problem, groups: list[NDArray[np.intp]], scale: float, start: NDArray[np.float64] | None = None
+    problem: _Problem,
+    groups: list[NDArray[np.intp]],
+    scale: float,
+    start: NDArray[np.float64] | None = None,
+    landmarks: Landmarks | None = None,
 ) -> NDArray[np.float64]:
-    """The unknowns, of which those in `groups` are free; from `start` on."""
+    """The unknowns, of which those in `groups` are free; from `start` on, and held by `landmarks`."""
     values, free = np.zeros(problem.count) if start is None else start.copy(), np.concatenate(groups)
     seen = problem.tracks.seen
-    of_prior = _PRIOR if problem.landmarks is None else _PRIOR_HELD
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if landmarks is None else _ROUNDS_HELD):
         stack = problem.stack(values)
         points = stack.placed(problem.tracks)
         lengths = np.linalg.norm(stack.errors(problem.tracks, points), axis=-1)[seen]
@@ -271,10 +272,10 @@ def _fitted(
         for group in groups:
             # The larger a change is, the less a pixel of it costs: a sum of sizes.
             prior[group] = min(spread, _FINEST * scale) / np.sqrt(np.linalg.norm(values[group]) / scale + _SMALL)
-        prior *= np.sqrt(of_prior * seen.sum() / len(groups))
+        prior *= np.sqrt((_PRIOR if landmarks is None else _PRIOR_HELD) * seen.sum() / len(groups))
         prior[-1] = 0.0  # a bend of all lenses leaves nothing open
 
-        held = None if problem.landmarks is None else _held(problem, problem.landmarks, points, spread)
+        held = None if landmarks is None else _Held.by(problem, landmarks, points, spread)
         told = (problem, values, free, bound, prior[free] / scale, held)
         # With derivatives of its own, as releases of SciPy differ in whether evaluations for them count.
         values[free] = least_squares(
@@ -292,21 +293,16 @@ class _Held:
     planes: NDArray[np.intp]
     weight: NDArray[np.float64]
 
+    @classmethod
+    def by(cls, problem: _Problem, landmarks: Landmarks, points: NDArray[np.float64], spread: float) -> _Held:
+        """What `landmarks` say of `points` [N, 3] that are seen to within `spread` pixels. A typical one counts as much
+        as a reprojection error that is typical, as nobody knows how true to surfaces sparse points are."""
+        planes, pixels, typical = _beside(problem, landmarks, points)
+        return cls(landmarks, planes, np.where(planes >= 0, pixels * spread / max(typical, spread), 0.0))
+
     def errors(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far `points` [..., N, 3] are beside their planes, as pixels of reprojection count."""
         return self.landmarks.off(points, self.planes) * self.weight
-
-
-def _held(problem: _Problem, landmarks: Landmarks, points: NDArray[np.float64], spread: float) -> _Held | None:
-    """What `landmarks` say of `points` [N, 3] that are seen to within `spread` pixels. A typical one counts as much as
-    a reprojection error that is typical, as nobody knows how true to surfaces sparse points are."""
-    planes = landmarks.nearest(points)
-    off = np.abs(landmarks.off(points, planes)) * problem.pixels_per_unit(points)
-    near = planes >= 0
-    if not near.any():
-        return None
-    typical = max(float(np.median(off[near])), spread)
-    return _Held(landmarks, planes, np.where(near, problem.pixels_per_unit(points) * spread / typical, 0.0))
 
 
 def _residual(
@@ -340,10 +336,14 @@ def _damped(errors: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
 
 
 def _slopes(changed: NDArray[np.float64], *told: Any) -> NDArray[np.float64]:
-    """Derivatives of `_residual`, by forward differences."""
-    beside = changed + np.concatenate([np.zeros((1, len(changed))), _STEP * np.eye(len(changed))])
-    found = _residual(beside, *told)
-    return np.ascontiguousarray(((found[1:] - found[0]) / _STEP).T)
+    """Derivatives of `_residual`, by forward differences, of many unknowns at once."""
+    start, slopes = _residual(changed, *told), []
+    tracks = told[0].tracks
+    at_once = max(1, _AT_ONCE // max(tracks.seen.size, 1))
+    for first in range(0, len(changed), at_once):
+        beside = changed + _STEP * np.eye(len(changed))[first : first + at_once]
+        slopes.append((_residual(beside, *told) - start) / _STEP)
+    return np.ascontiguousarray(np.concatenate(slopes).T)
 
 
 def corrections(fitted: FittedCameras, told: Mapping[str, Camera]) -> dict[str, CameraCorrection]:

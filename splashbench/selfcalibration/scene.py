@@ -219,7 +219,7 @@ def self_calibration(
     shown = plates() if plates is not None and steady is scene else make_clean_plates(steady)
     shown = {name: plate.without_beside() for name, plate in shown.items()}
     tracks = find_tracks(shown, scene.cameras)
-    right_ones = fit_cameras(tracks, scene.cameras, scene.initial_points(), lambda given: find_tracks(shown, given))
+    right_ones = fit_cameras(tracks, scene.cameras, scene.initial_points, lambda given: find_tracks(shown, given))
     found = replace(found, cameras=right_ones)
     light = {name: response for name, response in responses(tracks, shown).items() if not response.is_standard}
     found = replace(found, responses=light)

@@ -25,6 +25,7 @@ class StackedCameras:
 
     @classmethod
     def of(cls, cameras: Mapping[str, Camera], views: Sequence[str], k1: float = 0.0) -> StackedCameras:
+        """Those named `views`, in this order."""
         chosen = [cameras[name] for name in views]
         return cls(
             np.stack([camera.K for camera in chosen]),

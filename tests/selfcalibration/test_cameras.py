@@ -122,7 +122,7 @@ def test_where_all_cameras_turned_sparse_points_hold_the_world(
     """What cameras have in common is explained by other worlds, too."""
     told = all_turned(cameras, 2.0)
     tracks = find_tracks(plates, told)
-    found = fit_cameras(tracks, told, sparse_points(rough), lambda given: find_tracks(plates, given))
+    found = fit_cameras(tracks, told, lambda: sparse_points(rough), lambda given: find_tracks(plates, given))
     assert found is not None
     assert found.kinds == ("turned",)
     off = max(misplaced(camera, cameras[name]) for name, camera in found.cameras.items())
@@ -133,14 +133,47 @@ def test_where_all_cameras_turned_sparse_points_hold_the_world(
     assert off < 0.5 * max(misplaced(camera, cameras[name]) for name, camera in without.cameras.items())
 
 
+def same(first: FittedCameras | None, second: FittedCameras | None) -> bool:
+    assert first is not None
+    assert second is not None
+    return all(np.array_equal(camera.w2c, second.cameras[name].w2c) for name, camera in first.cameras.items())
+
+
 def test_sparse_points_of_another_place_are_not_believed(plates: dict[str, CleanPlate], cameras: Cameras) -> None:
+    told = all_turned(cameras, 0.5)
+    tracks = find_tracks(plates, told)
+    without = fit_cameras(tracks, told)
+    assert same(fit_cameras(tracks, told, lambda: 0.3 * sparse_points() + [0.2, 0.5, 0.1]), without)
+    assert not same(fit_cameras(tracks, told, sparse_points), without)
+
+
+def test_cameras_that_are_as_told_say_where_the_world_is_before_sparse_points_do(
+    plates: dict[str, CleanPlate], cameras: Cameras
+) -> None:
+    """Points that lie beside their places by a little would turn all cameras with them."""
     told = cameras | {"2": turned(cameras["2"], 0.5)}
     tracks = find_tracks(plates, told)
-    elsewhere = fit_cameras(tracks, told, 0.3 * sparse_points() + [0.2, 0.5, 0.1])
-    without = fitted(tracks, told)
-    assert elsewhere is not None
-    for name, camera in without.cameras.items():
-        np.testing.assert_array_equal(elsewhere.cameras[name].w2c, camera.w2c)
+    raised = fit_cameras(
+        tracks, told, lambda: sparse_points() + np.array([0, 0.02, 0]), lambda given: find_tracks(plates, given)
+    )
+    assert raised is not None
+    assert max(misplaced(camera, cameras[name]) for name, camera in raised.cameras.items()) < 0.1
+    assert same(raised, fit_cameras(tracks, told, again=lambda given: find_tracks(plates, given)))
+
+
+def test_hardly_any_match_by_the_cameras_found_leaves_them_as_found(tracks: Tracks, cameras: Cameras) -> None:
+    told = cameras | {"2": turned(cameras["2"], 0.5)}
+    found = fit_cameras(tracks, told, sparse_points, lambda given: tracks.kept(np.arange(0)))
+    assert found is not None
+    assert found.kinds == ("turned",)
+    assert misplaced(found.cameras["2"], cameras["2"]) < 0.2 * misplaced(told["2"], cameras["2"])
+
+
+def test_derivatives_in_parts_are_the_same(tracks: Tracks, cameras: Cameras, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = cameras | {"2": turned(cameras["2"], 0.5)}
+    at_once = fit_cameras(tracks, told)
+    monkeypatch.setattr("splashbench.selfcalibration.cameras._AT_ONCE", 1)
+    assert same(fit_cameras(tracks, told), at_once)
 
 
 def test_noise_has_nothing_in_common(cameras: Cameras) -> None:
