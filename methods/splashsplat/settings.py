@@ -38,7 +38,7 @@ Transmission = Literal["measured", "always", "never"]
 _MEASURED = 0.2
 
 #: Of the method; raised when a change alters figures, so that no study takes over runs from before.
-VERSION = "36"
+VERSION = "37"
 
 
 class SplashSplatConfig(MethodConfig):
@@ -93,7 +93,8 @@ class SplashSplatConfig(MethodConfig):
     #: level the liquid that rests in the container (needs gravity and the mesh, or a container in masks or footage)
     pool: bool = True
     # Velocity
-    #: free fall for the jet (needs gravity, the metric scale and the frames' times)
+    #: free fall for the jet (needs the direction of gravity, or a container in masks or footage; and the metric scale,
+    #: or that it is filmed how the jet begins or ends)
     ballistic: bool = True
     #: no motion where the level set's leads farther away from the observations than none
     gate_motion: bool = True

@@ -78,6 +78,7 @@ def _of_frame(track: Track, t: int, fraction: float, overlap: np.ndarray) -> lis
     far, other = abs(fraction), t + 1 if fraction > 0 else t - 1
     here, there = track.carriers.positions[track.carriers.rows(t)], track.moved(t, float(np.sign(fraction)))[0]
     stays = (sample(overlap, here) > _STEADY) & (sample(overlap, there) > _STEADY)
+    stays[track.motion.step(min(t, other)).falling(here, float(np.sign(fraction)))] = False
     still, moved = track.state(t), track.state(t, fraction)
     # phi along the way, or at the place, whichever is nearer to the surface.
     arrival = (sample(track.phi[other], there) / STEPS_PER_VOXEL).astype(np.float32)

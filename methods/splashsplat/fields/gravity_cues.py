@@ -29,7 +29,7 @@ class GravityCues:
 
     turn: [3, 3] scene axes to upright ones. jets: per frame, or None. floor: height above which the jets were found,
     scene units. pool, levels: the pool and its height per frame (NaN: none), or None and all NaN. container_depths:
-    per view the container's depth image, None where it hides nothing.
+    per view the container's depth image, None where it hides nothing. scaled: whether gravity's strength was told.
     """
 
     turn: np.ndarray
@@ -38,6 +38,18 @@ class GravityCues:
     pool: LiquidPool | None
     levels: np.ndarray
     container_depths: list[np.ndarray | None]
+    scaled: bool = True
+
+    def fall(self) -> str | None:
+        """How the jet falls, in words; None where there is none."""
+        jet = next((jet for jet in self.jets if jet is not None), None)
+        if jet is None:
+            return None
+        whence = "of the scene" if self.scaled else "by how its first drop and its last fall"
+        return (
+            f"passes height {jet.top:.3g} at {jet.speed:.3g} scene units/s; "
+            f"gravity {jet.gravity:.3g} scene units/s^2, {whence}"
+        )
 
     def refined(self, phi: np.ndarray, grid: Grid, t: int) -> np.ndarray:
         """The hull's distance `phi` of frame `t` on `grid` (voxels), with a full pool and without what floats on it;
@@ -47,9 +59,16 @@ class GravityCues:
         return self.pool.lowered(phi, grid, float(self.levels[t]), self.container_depths, self.jets[t])
 
     def jet_floor(self, t: int) -> float:
-        """Height down to which the jet of frame `t` flies freely: the pool's level, or where the jets were found."""
-        level = float(self.levels[t])
-        return level if np.isfinite(level) else self.floor
+        """Height down to which the jet of frame `t` flies freely: to the pool, or to the wall that its axis meets.
+
+        Where nobody sees how high the pool stands, it stands no higher than when it is seen next, as it fills up.
+        Where it never is, or there is no vessel, a jet flies down to where the jets were found.
+        """
+        known = self.levels[t:][np.isfinite(self.levels[t:])]
+        if len(known):
+            return float(known[0])
+        jet, vessel = self.jets[t], None if self.pool is None else self.pool.vessel
+        return self.floor if jet is None or vessel is None else min(self.floor, vessel.foot(jet.axis))
 
     def landed(self, grid: Grid, t: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Where carriers that fly from `start` to `end` [N, 3] (nodes of `grid`) until frame `t` come to rest.
@@ -90,8 +109,8 @@ def gravity_cues(
     """Look at all frames on a coarse grid over `bounds`.
 
     coarse: the masks as that grid needs them. gravity: unit vector [3]. metres_per_unit: None where the scale or the
-    frames' times are not known; then no jet is looked for, as the speed of a fall is not known either.
-    container_depths: see `GravityCues`.
+    frames' times are not known; then a jet has to tell by itself how fast it falls. container_depths: see
+    `GravityCues`.
     """
     turn = upright(gravity)
     vessel = None if container is None else Vessel.of(container.mesh, gravity)
@@ -103,7 +122,7 @@ def gravity_cues(
     levels = np.full(silhouettes.n_frames, np.nan) if pool is None else pool.levels()
     jets: list[Jet | None] = [None] * silhouettes.n_frames
     floor = -np.inf
-    if find_jets and metres_per_unit is not None:
+    if find_jets:
         grid = Grid.over(bounds, _CELLS)
         upright_nodes = grid.nodes().reshape(-1, 3) @ turn.T
         frames: list[Slices] = []
@@ -113,5 +132,9 @@ def gravity_cues(
             frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))
         floor = open_floor(frames, grid.voxel) if vessel is None else vessel.rim + _RIM_MARGIN * grid.voxel
         airborne = [framed(frame.above(floor), silhouettes.cameras, turn) for frame in frames]
-        jets = fit_jets(airborne, times, STANDARD_GRAVITY / metres_per_unit, grid.voxel)
-    return GravityCues(turn, jets, floor, pool, levels, container_depths)
+        strength = None if metres_per_unit is None else STANDARD_GRAVITY / metres_per_unit
+        lowest = None
+        if container is None or not container.hides:
+            lowest = [float(frame.height[0]) if len(frame.height) else np.inf for frame in frames]
+        jets = fit_jets(airborne, times, strength, grid.voxel, lowest)
+    return GravityCues(turn, jets, floor, pool, levels, container_depths, metres_per_unit is not None)

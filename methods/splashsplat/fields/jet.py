@@ -13,16 +13,18 @@ Coordinates are upright (vessel.py): horizontal two, then height. Scene units an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from splashbench.scene.camera import Camera
 
+from .falls import MOST, Ends, FreeFall, Unscaled
+
 STANDARD_GRAVITY = 9.81  # m/s^2
 # What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, of its radius
-# (voxels), and of the height of a tip or tail (voxels).
-_MIDDLE, _AREA, _RADIUS, _END = 0.1, 0.2, 0.5, 2.0
+# (voxels).
+_MIDDLE, _AREA, _RADIUS = 0.1, 0.2, 0.5
 # Neighbouring slices err alike: so many of them count as one.
 _ALIKE = 4
 _SLICES_AT_LEAST = 8
@@ -49,6 +51,8 @@ _ALIKE_BEADS = 2.0
 _FINER = np.linspace(0.93, 1.07, 29)
 # Speeds tried, up to so many times that of a fall through all that is seen.
 _SPEEDS, _FASTEST = 80, 4.0
+# Where gravity is not known: shares of the speed at which the agreement of beads is as usual.
+_USUAL = np.geomspace(0.5, 2, 19)
 
 
 @dataclass(frozen=True)
@@ -155,11 +159,18 @@ class Jet:
         return np.linalg.norm(points[:, :2] - self.axis(points[:, 2]), axis=1) - radius
 
 
-def fit_jets(frames: list[Slices], times: np.ndarray, gravity: float, voxel: float) -> list[Jet | None]:
+def fit_jets(
+    frames: list[Slices],
+    times: np.ndarray,
+    gravity: float | None,
+    voxel: float,
+    lowest: Sequence[float] | None = None,
+) -> list[Jet | None]:
     """The jet in each frame; None where no frame nearby shows one.
 
     All frames share the speed at one height; the nozzle may wander, so that its place and the drift are found for
-    every few frames. gravity: scene units / s^2; voxel: scene units.
+    every few frames. gravity: scene units / s^2; None where it is not known, and has to be told by how the jet's ends
+    fall. voxel: scene units. lowest: see `Ends.of`.
     """
     groups = [_merged(frames[start : start + _STEADY], voxel) for start in range(0, len(frames), _STEADY)]
     used = [number for number, group in enumerate(groups) if len(group.height) >= _SLICES_AT_LEAST]
@@ -168,33 +179,59 @@ def fit_jets(frames: list[Slices], times: np.ndarray, gravity: float, voxel: flo
     streams = [groups[number] for number in used]
     top = max(float(stream.height[-1]) for stream in streams)
     bottom = min(float(stream.height[0]) for stream in streams)
-    ends = _falls(frames, times, voxel, top, bottom)
-    fastest = _FASTEST * np.sqrt(2 * gravity * (top - bottom + voxel))
-    speeds = np.geomspace(fastest / 300, fastest, _SPEEDS)
-    tried = (_explained(streams, ends, float(speed), top, gravity, voxel) for speed in speeds)
-    _, speed, paths = min(tried, key=lambda explained: explained[0])
-    beads = _Beads.of(frames, times, voxel, top, gravity)
-    near = speeds[np.abs(np.log(speeds / speed)) <= np.log(_ALIKE_BEADS)]
-    agreement, count = np.array([beads.agreement(one) for one in near]).T
-    clearest = int(np.argmax(np.nan_to_num(agreement)))
-    chance = _CHANCE * np.sqrt(_ALIKE / max(count[clearest], 1))
-    usual = np.nanmedian(agreement) if np.isfinite(agreement).any() else np.nan
-    if agreement[clearest] - usual >= max(_BEADED, chance):
-        finer = near[clearest] * _FINER
-        speed = float(finer[np.argmax(np.nan_to_num([beads.agreement(one)[0] for one in finer]))])
-        _, _, paths = _explained(streams, ends, speed, top, gravity, voxel)
-    elif speed in (speeds[0], speeds[-1]):  # nothing bends, thins or falls: any speed will do
+    ends = Ends.of([frame.height for frame in frames], times, voxel, top, bottom, lowest)
+    beads = _Beads.of(frames, times, voxel)
+    if gravity is None:
+        fall = _unscaled_fall(streams, ends, beads, times, top, bottom, voxel)
+    else:
+        fall = _fall(streams, ends, beads, top, bottom, gravity, voxel)
+    if fall is None:
         return [None] * len(frames)
+    _, paths = _explained(streams, fall, voxel)
     path_of_group = {number: path for number, path in zip(used, paths) if path is not None}
     jets: list[Jet | None] = []
     for t in range(len(frames)):
         near = [number for number in path_of_group if abs(number - t // _STEADY) <= 1]
         if near:
             path, radius = path_of_group[min(near, key=lambda number: abs(number - t // _STEADY))]
-            jets.append(Jet(top, path[0], path[1], speed, gravity, radius))
+            jets.append(Jet(top, path[0], path[1], fall.speed, fall.gravity, radius))
         else:
             jets.append(None)
     return jets
+
+
+def _fall(
+    streams: list[Slices], ends: Ends, beads: _Beads, top: float, bottom: float, gravity: float, voxel: float
+) -> FreeFall | None:
+    """The fall that explains the jet's shape, ends and beads; None where any speed will do."""
+    fastest = _FASTEST * np.sqrt(2 * gravity * (top - bottom + voxel))
+    falls = [FreeFall(top, float(speed), gravity) for speed in np.geomspace(fastest / 300, fastest, _SPEEDS)]
+    costs = [_explained(streams, fall, voxel)[0] + ends.misfit(fall) for fall in falls]
+    best = falls[int(np.argmin(costs))]
+    near = [fall for fall in falls if abs(np.log(fall.speed / best.speed)) <= np.log(_ALIKE_BEADS)]
+    clearest = beads.clearest(near, near)
+    if clearest is not None:
+        return beads.best([replace(clearest, speed=clearest.speed * factor) for factor in _FINER])
+    # At the fastest and the slowest nothing bends, thins or falls.
+    return None if best in (falls[0], falls[-1]) else best
+
+
+def _unscaled_fall(
+    streams: list[Slices], ends: Ends, beads: _Beads, times: np.ndarray, top: float, bottom: float, voxel: float
+) -> FreeFall | None:
+    """`_fall` where gravity is not known; None where the ends do not tell how fast they fall."""
+    if not ends.runs:
+        return None
+    # Those of the speeds that are tried where gravity is known.
+    fastest = 1 / (2 * _FASTEST**2 * (top - bottom + voxel))
+    shapes = fastest * np.geomspace(1, 300**2, _SPEEDS)
+    costs = np.array([_explained(streams, FreeFall(top, 1.0, float(shape)), voxel)[0] for shape in shapes])
+    tried = Unscaled.of(shapes, costs, ends, times, top, bottom)
+    if not tried.known:
+        return None
+    best = tried.best()
+    clearest = beads.clearest(tried.as_good(), [best.faster(factor) for factor in _USUAL])
+    return best if clearest is None else beads.best([clearest.faster(factor) for factor in _FINER])
 
 
 def _merged(frames: list[Slices], voxel: float) -> Slices:
@@ -210,30 +247,28 @@ def _merged(frames: list[Slices], voxel: float) -> Slices:
 Path = tuple[np.ndarray, float]
 
 
-def _explained(
-    groups: list[Slices], ends: list[np.ndarray], speed: float, top: float, gravity: float, voxel: float
-) -> tuple[float, float, list[Path | None]]:
-    """How badly a vertical `speed` at height `top` explains everything, the speed, and each group's path and radius;
-    None for a group whose slices are no jet's, but drops at different places, or a lump."""
-    cost = _fall_cost(ends, top, speed, gravity, voxel)
+def _explained(groups: list[Slices], fall: FreeFall, voxel: float) -> tuple[float, list[Path | None]]:
+    """How badly `fall` explains what all groups look like, and each one's path and radius; None for a group whose
+    slices are no jet's, but drops at different places, or a lump."""
+    cost = 0.0
     paths: list[Path | None] = []
     for group in groups:
-        tau = (np.sqrt(speed**2 + 2 * gravity * (top - group.height)) - speed) / gravity
+        tau = fall.lasted(group.height)
         design = np.stack([np.ones_like(tau), tau], axis=1)
         path = _robust(design, group.middle, _MIDDLE * voxel)
         error = np.linalg.norm(group.middle - design @ path, axis=1) / (_MIDDLE * voxel)
         # Slices are level: what passes through one is its area times the vertical speed.
-        thinning = np.log(group.area * (speed + gravity * tau))
+        thinning = np.log(group.area * fall.down(group.height))
         # A hull's radius is uncertain by a pixel or so, which means more in a thin jet.
         doubt = np.hypot(_AREA, 2 * _RADIUS * voxel / np.sqrt(group.area / np.pi))
         unlike = np.abs(thinning - np.median(thinning))
         spread = unlike / doubt
-        cost += float((np.minimum(error**2, 9) + np.minimum(spread**2, 9)).sum()) / _ALIKE
+        cost += float((np.minimum(error**2, MOST) + np.minimum(spread**2, MOST)).sum()) / _ALIKE
         # The volume that passes is one at all heights: it gives the radius at the top.
-        area = np.exp(np.median(thinning)) / speed
+        area = np.exp(np.median(thinning)) / fall.speed
         steady = np.median(error) * _MIDDLE < _ASTRAY and np.median(unlike) < _UNEVEN
         paths.append((path, float(np.sqrt(area / np.pi))) if steady else None)
-    return cost, speed, paths
+    return cost, paths
 
 
 def _robust(design: np.ndarray, values: np.ndarray, sigma: float) -> np.ndarray:
@@ -257,11 +292,9 @@ class _Beads:
     times: np.ndarray
     height: np.ndarray
     thickness: np.ndarray
-    top: float
-    gravity: float
 
     @classmethod
-    def of(cls, frames: list[Slices], times: np.ndarray, voxel: float, top: float, gravity: float) -> _Beads:
+    def of(cls, frames: list[Slices], times: np.ndarray, voxel: float) -> _Beads:
         lowest = min((float(frame.height[0]) for frame in frames if len(frame.height)), default=0.0)
         levels = [np.rint((frame.height - lowest) / voxel).astype(int) for frame in frames]
         count = 1 + max((int(level[-1]) for level in levels if len(level)), default=0)
@@ -274,14 +307,26 @@ class _Beads:
         usual = np.where(there, areas, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
         with np.errstate(invalid="ignore"):
             thickness = np.where(usual > 0, areas / np.where(usual > 0, usual, 1) - 1, np.nan)
-        return cls(times, lowest + voxel * np.arange(count), thickness, top, gravity)
+        return cls(times, lowest + voxel * np.arange(count), thickness)
 
-    def agreement(self, speed: float) -> tuple[float, int]:
-        """Correlation of each frame's thickness with that of the frame before where it fell from, at a vertical `speed`
-        at the top, NaN where hardly any of it was seen then; and of how many slices."""
-        down = np.sqrt(np.maximum(speed**2 + 2 * self.gravity * (self.top - self.height), 0))
-        # Falling times fall as heights rise.
-        fallen = (speed - down) / self.gravity
+    def clearest(self, falls: list[FreeFall], others: list[FreeFall]) -> FreeFall | None:
+        """The one of `falls` by which beads agree, where they do so by far more than by most `others`."""
+        agreement, count = np.array([self.agreement(fall) for fall in falls]).T
+        usual = agreement if others is falls else np.array([self.agreement(fall)[0] for fall in others])
+        if not np.isfinite(agreement).any() or not np.isfinite(usual).any():
+            return None
+        best = int(np.nanargmax(agreement))
+        chance = _CHANCE * np.sqrt(_ALIKE / max(count[best], 1))
+        return falls[best] if agreement[best] - np.nanmedian(usual) >= max(_BEADED, chance) else None
+
+    def best(self, falls: list[FreeFall]) -> FreeFall:
+        """The one of `falls` by which beads agree most."""
+        return falls[int(np.argmax(np.nan_to_num([self.agreement(fall)[0] for fall in falls])))]
+
+    def agreement(self, fall: FreeFall) -> tuple[float, int]:
+        """Correlation of each frame's thickness with that of the frame before where it fell from by `fall`, NaN where
+        hardly any of it was seen then; and of how many slices."""
+        fallen = -fall.lasted(self.height)  # rises with the height
         together = first = second = 0.0
         looked, seen = 0, 0
         for t in range(len(self.times) - 1):
@@ -297,31 +342,3 @@ class _Beads:
             first += float(expected[known] @ expected[known])
             second += float(now[wet][known] @ now[wet][known])
         return together / max(float(np.sqrt(first * second)), 1e-12) if seen > _SEEN * looked else np.nan, seen
-
-
-def _falls(frames: list[Slices], times: np.ndarray, voxel: float, top: float, bottom: float) -> list[np.ndarray]:
-    """Runs of (time, height) of the jet's first drop, and of its last, while both ends are in the air."""
-    runs: list[list[tuple[float, float]]] = []
-    for lower in (True, False):
-        run: list[tuple[float, float]] = []
-        for frame, time in zip(frames, times):
-            end = None if len(frame.height) == 0 else float(frame.height[0] if lower else frame.height[-1])
-            free = end is not None and bottom + 2 * voxel < end < top - 2 * voxel
-            if run and not (free and end is not None and end < run[-1][1] - voxel):
-                runs.append(run)
-                run = []
-            if free and end is not None:
-                run.append((float(time), end))
-        runs.append(run)
-    return [np.array(run) for run in runs if len(run) >= 2]
-
-
-def _fall_cost(runs: list[np.ndarray], top: float, speed: float, gravity: float, voxel: float) -> float:
-    """Squared errors of the ends' fall, over _END voxels; each run starts when it likes."""
-    cost = 0.0
-    for run in runs:
-        fallen = (np.sqrt(np.maximum(speed**2 + 2 * gravity * (top - run[:, 1]), 0)) - speed) / gravity
-        lasted = np.maximum(run[:, 0] - np.median(run[:, 0] - fallen), 0)
-        error = (top - speed * lasted - 0.5 * gravity * lasted**2 - run[:, 1]) / (_END * voxel)
-        cost += float(np.minimum(error**2, 9).sum())
-    return cost

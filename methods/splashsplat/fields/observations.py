@@ -40,7 +40,7 @@ from .rim import Rim, rim_of
 Report = Callable[[float, str], None]
 
 # Raised when a change alters what is stored for other runs, so that no study takes over what is from before.
-_REVISION = 14
+_REVISION = 15
 # Pixels that a voxel of a coarse grid spans, at least, where smaller masks stand for large ones.
 _COARSE_PIXELS = 3.0
 
@@ -261,6 +261,9 @@ def observe(
                 find_pool=settings.pool,
                 find_jets=settings.ballistic,
             )
+        fall = cues.fall()
+        if fall is not None:
+            run.note("jet", fall)
     repeated = repeated_frames(scene, silhouettes) if settings.repeats else np.zeros(scene.n_frames, dtype=bool)
     if repeated.any():
         run.note(

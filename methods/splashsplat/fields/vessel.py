@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -81,6 +82,14 @@ class Vessel:
         scale = self.grid.voxel / grid.voxel
         over_range(_room, grid.shape[0], self.solid, self.inside, origin, np.ascontiguousarray(turn), scale, room)
         return room
+
+    def foot(self, axis: Callable[[np.ndarray], np.ndarray]) -> float:
+        """Height at which what comes down along `axis`, from heights [N] to upright places [N, 2], meets the wall from
+        within; the rim where it does not come in."""
+        heights = self.rim - 0.5 * self.grid.voxel * np.arange(2 * self.grid.shape[2])
+        points = np.concatenate([axis(heights), heights[:, None]], axis=1)
+        within = sample(self.inside, self.grid.to_voxels(points)) > _ENCLOSED
+        return float(heights[int(np.argmin(within))]) if within.any() and within[0] else self.rim
 
     def walled(self, points: np.ndarray) -> np.ndarray:
         """bool [N]: whether `points` [N, 3] (scene units) lie in the container's walls."""

@@ -43,7 +43,7 @@ class FrameStep:
         """
         ends, deformed = forecast(self.control, self.factor, positions, deformation, duration)
         if self.fall is not None:
-            falls = self._falling(self.fall, positions, duration)
+            falls = self.falling(positions, duration)
             ends[falls] = self.fall.moved(positions[falls], duration)
             deformed[falls] = self.fall.deformed(positions[falls], deformation[falls], duration)
         return ends, deformed
@@ -52,14 +52,16 @@ class FrameStep:
         """The places that `forecast` gives, without F."""
         ends = moved(self.control, self.factor, positions, duration)
         if self.fall is not None:
-            falls = self._falling(self.fall, positions, duration)
+            falls = self.falling(positions, duration)
             ends[falls] = self.fall.moved(positions[falls], duration)
         return ends
 
-    def _falling(self, fall: JetFall, positions: np.ndarray, duration: float) -> np.ndarray:
-        """Numbers of the carriers that fall for `duration` frames, int64."""
-        falls = np.flatnonzero(fall.holds(positions))
-        return falls[fall.holds(fall.moved(positions[falls], 0.5 * duration))]
+    def falling(self, positions: np.ndarray, duration: float) -> np.ndarray:
+        """Numbers of the carriers at `positions` [N, 3] that fall in the jet for `duration` frames, int64."""
+        if self.fall is None:
+            return np.zeros(0, dtype=np.int64)
+        falls = np.flatnonzero(self.fall.holds(positions))
+        return falls[self.fall.holds(self.fall.moved(positions[falls], 0.5 * duration))]
 
 
 @dataclass(frozen=True)

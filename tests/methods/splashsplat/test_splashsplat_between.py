@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,9 @@ from splashbench.scene.geometry import STEPS_PER_VOXEL
 from splashbench_methods.splashsplat.carriers.between import carriers_at, steadiness
 from splashbench_methods.splashsplat.carriers.population import Carriers
 from splashbench_methods.splashsplat.carriers.subframe import Track
+from splashbench_methods.splashsplat.fields.jet import Jet
 from splashbench_methods.splashsplat.motion.between import moved_distance
+from splashbench_methods.splashsplat.motion.fall import JetFall
 from splashbench_methods.splashsplat.motion.steps import Motion
 
 SHAPE = (24, 24, 64)
@@ -61,6 +65,20 @@ def test_a_jet_that_flows_on_stays_full_and_gets_no_longer(fraction: float):
     full = at_frame > 0.5 * at_frame.max()
     assert between[full] == pytest.approx(at_frame[full], rel=0.35)
     assert between[~full].sum() < 0.05 * at_frame.sum()
+
+
+def test_a_jet_whose_fall_is_known_flows_though_its_liquid_keeps_its_place() -> None:
+    jet = column(8, 56)
+    still = track_of(jet, jet, fall=0)
+    fall = JetFall(Jet(60.0, np.full(2, 12.0), np.zeros(2), 30.0, 10.0, 8.0), 4.0, np.eye(3), still.grid, 0.2)
+    flowing = replace(still, motion=replace(still.motion, falls=[fall]))
+    time = TIMES[0] + 0.3 * (TIMES[1] - TIMES[0])
+    before = still.state(0).positions[:, 2]
+    assert torch.equal(carriers_at(still, TIMES, time)[0][1].positions[:, 2], before)
+    moved = before - carriers_at(flowing, TIMES, time)[0][1].positions[:, 2]
+    high = before > 30  # others land within the step
+    assert (moved[high] > 0.3 * 0.2 * 30).all()
+    assert (moved[high] < 0.3 * 0.2 * 50).all()
 
 
 @pytest.mark.parametrize("fraction", [0.3, 0.5, 0.9])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -297,5 +299,29 @@ def test_a_camera_sees_its_own_side_of_the_liquid_only():
 
 
 def test_a_jet_flies_down_to_the_pool_or_to_where_it_was_found():
-    cues = GravityCues(np.eye(3), [None, None], 0.3, None, np.array([np.nan, 0.1]), [])
-    assert [cues.jet_floor(t) for t in range(2)] == [0.3, 0.1]
+    levels = np.array([0.2, np.nan, 0.1, np.nan])
+    cues = GravityCues(np.eye(3), [None] * 4, 0.3, None, levels, [])
+    # It fills up: where its level is not seen, it is no higher than when it is seen next.
+    assert [cues.jet_floor(t) for t in range(4)] == [0.2, 0.1, 0.1, 0.3]
+
+
+def test_a_jet_flies_down_to_the_wall_where_no_pool_is_seen(poured):
+    pool = LiquidPool(Vessel.of(poured.mesh, DOWN), Silhouettes(poured), True)
+    middle, outside = np.zeros(2), np.array([0.3, 0.0])
+    jets = [Jet(0.3, middle, np.zeros(2), 1.0, G, 0.01), None, Jet(0.3, outside, np.zeros(2), 1.0, G, 0.01)]
+    cues = GravityCues(np.eye(3), jets, 0.16, pool, np.full(3, np.nan), [])
+    assert cues.jet_floor(0) == pytest.approx(0, abs=1.5 * pool.vessel.grid.voxel)  # the box's own floor
+    assert cues.jet_floor(1) == 0.16
+    assert cues.jet_floor(2) == pytest.approx(pool.vessel.rim)  # it does not come in
+    # What drifts meets the side wall before the floor; it is .08 away along the first upright axis.
+    lands = pool.vessel.foot(lambda heights: np.stack([0.12 - heights, 0 * heights], axis=1))
+    assert lands == pytest.approx(0.04, abs=2 * pool.vessel.grid.voxel)
+
+
+def test_in_words_a_jet_says_whence_gravity_is_known():
+    jet = Jet(0.3, np.zeros(2), np.zeros(2), 1.2, 9.0, 0.01)
+    told = GravityCues(np.eye(3), [None, jet], 0.3, None, np.full(2, np.nan), [])
+    assert told.fall() == "passes height 0.3 at 1.2 scene units/s; gravity 9 scene units/s^2, of the scene"
+    found = replace(told, scaled=False)
+    assert found.fall().endswith("by how its first drop and its last fall")
+    assert replace(told, jets=[None, None]).fall() is None

@@ -1,0 +1,145 @@
+"""How fast a jet falls by its ends: its first drop and its last fall as any stone does. Not in the paper.
+
+Where gravity is known, a jet's shape tells its speed. Where nobody told the scale of the scene, the strength of gravity
+is not known either, and shape tells the ratio of both alone: a jet that bends and thins alike may be slow where gravity
+is weak, or fast where it is strong. How long it takes for its ends to fall through what is seen says which.
+
+Heights in scene units, times in seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+# Standard deviation of the height of a tip or tail, voxels.
+_END = 2.0
+# What an error costs at the most: three standard deviations.
+MOST = 9.0
+# Free falls through all that is seen that are tried: how many, and how long they last, from this share of the shortest
+# step between frames to this one of all frames.
+_LASTED, _SHORTEST, _LONGEST = 64, 0.5, 1.0
+# Falls explain as much as others to within two standard deviations. Where all of these last equally long to this
+# factor, it is known how long a fall lasts.
+_AS_MUCH, _KNOWN = 4.0, 2.5
+
+
+@dataclass(frozen=True)
+class FreeFall:
+    """Of liquid that passes the height `top` at `speed` downwards. gravity: scene units / s^2."""
+
+    top: float
+    speed: float
+    gravity: float
+
+    def down(self, height: np.ndarray) -> np.ndarray:
+        """Speed downwards at `height` [...]; 0 where it does not rise so high."""
+        return np.asarray(np.sqrt(np.maximum(self.speed**2 + 2 * self.gravity * (self.top - height), 0)))
+
+    def lasted(self, height: np.ndarray) -> np.ndarray:
+        """Seconds from the top down to `height` [...], negative above it."""
+        return np.asarray((self.down(height) - self.speed) / self.gravity)
+
+    def faster(self, factor: float) -> FreeFall:
+        """The one `factor` times as fast that has the same shape."""
+        return FreeFall(self.top, factor * self.speed, factor**2 * self.gravity)
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Runs of (time, height) of a jet's first drop, and of its last, while both are in the air: each [n, 2], n >= 2."""
+
+    runs: list[np.ndarray]
+    voxel: float
+
+    @classmethod
+    def of(
+        cls,
+        heights: Sequence[np.ndarray],
+        times: np.ndarray,
+        voxel: float,
+        top: float,
+        bottom: float,
+        lowest: Sequence[float] | None = None,
+    ) -> Ends:
+        """heights: of the slices of each frame, ascending, which lie between `bottom` and `top`. lowest: of all liquid
+        in each frame, infinite for none, where it is seen down to the ground; without it first drops are followed down
+        to `bottom`."""
+        ground = bottom if lowest is None else min(lowest)
+        first = [_end(height, 0) for height in heights] if lowest is None else lowest
+        last = [_end(height, -1) for height in heights]
+        runs = [*_runs(first, times, voxel, ground, top), *_runs(last, times, voxel, bottom, top)]
+        return cls(runs, voxel)
+
+    def misfit(self, fall: FreeFall) -> float:
+        """Squared errors of the ends' fall, over _END voxels; each run starts when it likes."""
+        cost = 0.0
+        for run in self.runs:
+            fallen = fall.lasted(run[:, 1])
+            lasted = np.maximum(run[:, 0] - np.median(run[:, 0] - fallen), 0)
+            way = fall.speed * lasted + 0.5 * fall.gravity * lasted**2
+            error = (fall.top - way - run[:, 1]) / (_END * self.voxel)
+            cost += float(np.minimum(error**2, MOST).sum())
+        return cost
+
+
+def _end(heights: np.ndarray, which: int) -> float:
+    return float(heights[which]) if len(heights) else np.nan
+
+
+def _runs(ends: Sequence[float], times: np.ndarray, voxel: float, bottom: float, top: float) -> Iterator[np.ndarray]:
+    """What of `ends`, a height a frame, falls freely between `bottom` and `top`."""
+    run: list[tuple[float, float]] = []
+    for end, time in zip([*ends, np.nan], [*times, np.nan]):
+        free = bottom + 2 * voxel < end < top - 2 * voxel
+        if run and not (free and end < run[-1][1] - voxel):
+            if len(run) >= 2:
+                yield np.array(run)
+            run = []
+        if free:
+            run.append((float(time), float(end)))
+
+
+@dataclass(frozen=True, eq=False)
+class Unscaled:
+    """Free falls where gravity is not known. falls: [S][L], of S shapes and L durations each. cost: [S, L],
+    how badly they explain shape and ends."""
+
+    falls: list[list[FreeFall]]
+    cost: np.ndarray
+
+    @classmethod
+    def of(
+        cls, shapes: np.ndarray, costs: np.ndarray, ends: Ends, times: np.ndarray, top: float, bottom: float
+    ) -> Unscaled:
+        """shapes: [S] of gravity over the square of the speed at the top, 1 / scene units; costs: [S], how badly these
+        explain what a jet looks like."""
+        steps = np.diff(times)
+        durations = np.geomspace(_SHORTEST * steps.min(), _LONGEST * (times[-1] - times[0]), _LASTED)
+        falls = []
+        for shape in shapes:
+            # Of a fall through all that is seen: at a speed of 1 it would last so long, and gravity be `shape`.
+            lasts = float(FreeFall(top, 1.0, float(shape)).lasted(np.array(bottom)))
+            falls.append([FreeFall(top, 1.0, float(shape)).faster(lasts / float(duration)) for duration in durations])
+        fallen = np.array([[ends.misfit(fall) for fall in row] for row in falls])
+        return cls(falls, costs[:, None] + fallen)
+
+    @property
+    def known(self) -> bool:
+        """Whether the ends tell how long a fall lasts."""
+        by_duration = self.cost.min(axis=0)
+        as_good = np.flatnonzero(by_duration < by_duration.min() + _AS_MUCH)
+        lasts = [self.falls[0][n].speed for n in (as_good[-1], as_good[0])]  # the shorter, the faster
+        within = as_good[0] > 0 and as_good[-1] < self.cost.shape[1] - 1
+        return bool(within and lasts[1] <= _KNOWN * lasts[0])
+
+    def best(self) -> FreeFall:
+        """The fall that explains most."""
+        shape, duration = np.unravel_index(int(self.cost.argmin()), self.cost.shape)
+        return self.falls[shape][duration]
+
+    def as_good(self) -> list[FreeFall]:
+        """Those that explain as much."""
+        return [self.falls[s][d] for s, d in np.argwhere(self.cost < self.cost.min() + _AS_MUCH)]
