@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,9 @@ from splashbench.submission import Submission
 from splashbench_methods.splashsplat.fields.container import known_container
 from splashbench_methods.splashsplat.fields.near_wall import near_wall
 from splashbench_methods.splashsplat.fields.rim import rim_of
+
+#: Timesteps of the small pour in which its first drop and its last fall.
+_FALLING = (1, 3, 45)
 
 
 def method() -> list[Path]:
@@ -332,6 +335,24 @@ def turned() -> list[Path]:
         axes.contour(mask[crop], levels=[0.5], colors=["white"], linewidths=1)
         axes.contour(hull[crop], levels=[0.5], colors=[ORANGE], linewidths=1.2)
     return [store(figure, "method_turned.png", 120)]
+
+
+def falling() -> list[Path]:
+    """Timesteps that no fit saw, in a test view: as photographed, and by carriers that do not and do fall."""
+    folder = made(WORK / "told_nothing_small", *POUR, str(WORK / "told_nothing_small"), *SMALL)
+    scene = Scene.open(folder)
+    view = scene.test[0]
+    shown: dict[str, Callable[[str, int], NDArray[np.uint8]]] = {"as photographed": scene.image}
+    for title, falls in (("no jet is known", "false"), ("the jet falls as its ends tell", "true")):
+        out = WORK / f"falling_{falls}"
+        settings = ("--preset", "quick", "--withhold", "odd", "--set", f"ballistic={falls}")
+        shown[title] = Submission.open(made(out, "run", "splashsplat", str(folder), str(out), *settings)).rendering
+    figure = Figure(figsize=(6.6, 6.8), layout="constrained")
+    for row, frame in zip(figure.subplots(len(_FALLING), 3), _FALLING):
+        crop = window(scene.mask(view, scene.n_frames // 2), 12)
+        for axes, (title, picture) in zip(row, shown.items()):
+            bare(axes, title if frame == _FALLING[0] else "").imshow(picture(view, frame)[crop])
+    return [store(figure, "method_falling.png", 110)]
 
 
 def _hull_seen(silhouettes: Silhouettes, frame: int, camera: Camera) -> NDArray[np.bool_]:

@@ -216,6 +216,7 @@ GROUPS: dict[str, Callable[[], list[Path]]] = {
     "clocks": method_pictures.clocks,
     "cut_off": method_pictures.cut_off,
     "turned": method_pictures.turned,
+    "falling": method_pictures.falling,
     "transmission": method_pictures.transmission,
     "perturbations": perturbations,
     "tutorial": tutorial,

@@ -96,23 +96,14 @@ class GravityCues:
 
 def gravity_cues(
     silhouettes: Silhouettes,
-    coarse: Silhouettes,
-    bounds: Bounds,
     container: ContainerOcclusion | None,
     gravity: np.ndarray,
-    metres_per_unit: float | None,
-    times: np.ndarray,
     container_depths: list[np.ndarray | None],
     find_pool: bool = True,
-    find_jets: bool = True,
+    falling: FallingJets | None = None,
 ) -> GravityCues:
-    """Look at all frames on a coarse grid over `bounds`.
-
-    coarse: the masks as that grid needs them. gravity: unit vector [3]. metres_per_unit: None where the scale or the
-    frames' times are not known; then a jet has to tell by itself how fast it falls. container_depths: see
-    `GravityCues`.
-    """
-    turn = upright(gravity)
+    """What follows from `gravity`, a unit vector [3]. container_depths: see `GravityCues`. falling: the jets, where
+    they were looked for."""
     vessel = None if container is None else Vessel.of(container.mesh, gravity)
     pool = (
         None
@@ -120,21 +111,48 @@ def gravity_cues(
         else LiquidPool(vessel, silhouettes, container.hides)
     )
     levels = np.full(silhouettes.n_frames, np.nan) if pool is None else pool.levels()
-    jets: list[Jet | None] = [None] * silhouettes.n_frames
-    floor = -np.inf
-    if find_jets:
-        grid = Grid.over(bounds, _CELLS)
-        upright_nodes = grid.nodes().reshape(-1, 3) @ turn.T
-        frames: list[Slices] = []
-        for phi in signed_distance_frames(coarse, grid, "silhouette", container):
-            filled = np.clip(0.5 - phi.reshape(-1), 0, 1)
-            inside = filled > 0
-            frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))
-        floor = open_floor(frames, grid.voxel) if vessel is None else vessel.rim + _RIM_MARGIN * grid.voxel
-        airborne = [framed(frame.above(floor), silhouettes.cameras, turn) for frame in frames]
-        strength = None if metres_per_unit is None else STANDARD_GRAVITY / metres_per_unit
-        lowest = None
-        if container is None or not container.hides:
-            lowest = [float(frame.height[0]) if len(frame.height) else np.inf for frame in frames]
-        jets = fit_jets(airborne, times, strength, grid.voxel, lowest)
-    return GravityCues(turn, jets, floor, pool, levels, container_depths, metres_per_unit is not None)
+    if falling is None:
+        falling = FallingJets([None] * silhouettes.n_frames, -np.inf, True)
+    return GravityCues(upright(gravity), falling.jets, falling.floor, pool, levels, container_depths, falling.scaled)
+
+
+@dataclass(frozen=True)
+class FallingJets:
+    """jets: per frame, or None. floor, scaled: see `GravityCues`."""
+
+    jets: list[Jet | None]
+    floor: float
+    scaled: bool
+
+
+def falling_jets(
+    silhouettes: Silhouettes,
+    coarse: Silhouettes,
+    bounds: Bounds,
+    container: ContainerOcclusion | None,
+    gravity: np.ndarray,
+    metres_per_unit: float | None,
+    times: np.ndarray,
+) -> FallingJets:
+    """The jets of all frames, by hulls on a coarse grid over `bounds`.
+
+    coarse: the masks as that grid needs them. gravity: unit vector [3]. metres_per_unit: None where the scale or the
+    frames' times are not known; then a jet has to tell by itself how fast it falls.
+    """
+    turn = upright(gravity)
+    vessel = None if container is None else Vessel.of(container.mesh, gravity)
+    grid = Grid.over(bounds, _CELLS)
+    upright_nodes = grid.nodes().reshape(-1, 3) @ turn.T
+    frames: list[Slices] = []
+    for phi in signed_distance_frames(coarse, grid, "silhouette", container):
+        filled = np.clip(0.5 - phi.reshape(-1), 0, 1)
+        inside = filled > 0
+        frames.append(slices_of(upright_nodes[inside], filled[inside], grid.voxel))
+    floor = open_floor(frames, grid.voxel) if vessel is None else vessel.rim + _RIM_MARGIN * grid.voxel
+    airborne = [framed(frame.above(floor), silhouettes.cameras, turn) for frame in frames]
+    strength = None if metres_per_unit is None else STANDARD_GRAVITY / metres_per_unit
+    lowest = None
+    if container is None or not container.hides:
+        lowest = [float(frame.height[0]) if len(frame.height) else np.inf for frame in frames]
+    jets = fit_jets(airborne, times, strength, grid.voxel, lowest)
+    return FallingJets(jets, floor, strength is not None)

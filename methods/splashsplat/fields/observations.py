@@ -32,7 +32,7 @@ from splashbench.scene.geometry import SignedDistance
 from splashbench.scene.scene import TrainingScene
 
 from .container import KnownContainer, known_container
-from .gravity_cues import GravityCues, gravity_cues
+from .gravity_cues import FallingJets, GravityCues, falling_jets, gravity_cues
 from .occlusion import LiquidOcclusion
 from .repeats import repeated_frames
 from .rim import Rim, rim_of
@@ -180,7 +180,7 @@ def _standing(scene: TrainingScene) -> Standing:
 class Sighting:
     """What the masks of `scene` say whatever the grids. silhouettes, container: see `Observations`. coarse: the masks
     as coarse grids need them, smaller where they are large. rim: of the container, where it was looked for. bounds:
-    the padded box around all liquid."""
+    the padded box around all liquid. gravity: unit vector [3], None where it is not known."""
 
     scene: TrainingScene
     silhouettes: Silhouettes
@@ -188,6 +188,18 @@ class Sighting:
     container: ContainerOcclusion | None
     rim: Rim | None
     bounds: Bounds
+    gravity: np.ndarray | None
+
+    @cached_property
+    def jets(self) -> FallingJets | None:
+        """The jets of all frames; None where gravity is not known."""
+        if self.gravity is None:
+            return None
+        scene = self.scene
+        metres = None if scene.times_source == "nominal" else scene.metres_per_unit
+        return falling_jets(
+            self.silhouettes, self.coarse, self.bounds, self.container, self.gravity, metres, scene.times
+        )
 
     @cached_property
     def observable(self) -> Observable:
@@ -249,18 +261,8 @@ def observe(
     if gravity is not None and (settings.pool or settings.ballistic):
         report(0.0, "looking for the jet and the pool")
         with run.stage("jet and pool"):
-            cues = gravity_cues(
-                silhouettes,
-                sighting.coarse,
-                bounds,
-                container,
-                gravity,
-                None if scene.times_source == "nominal" else scene.metres_per_unit,
-                scene.times,
-                depths,
-                find_pool=settings.pool,
-                find_jets=settings.ballistic,
-            )
+            falling = sighting.jets if settings.ballistic else None
+            cues = gravity_cues(silhouettes, container, gravity, depths, settings.pool, falling)
         fall = cues.fall()
         if fall is not None:
             run.note("jet", fall)
@@ -300,7 +302,7 @@ def _sighting(
             rim = rim_of(known, scene, silhouettes.failed_masks)
         container = container.with_mesh(rim.mesh)
     bounds = _bounds(scene, silhouettes, coarse, container, settings, run, report)
-    found = before[key] = Sighting(scene, silhouettes, coarse, container, rim, bounds)
+    found = before[key] = Sighting(scene, silhouettes, coarse, container, rim, bounds, known.gravity)
     return found
 
 

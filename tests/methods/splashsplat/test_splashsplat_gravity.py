@@ -15,7 +15,7 @@ from splashbench.observe.occlusion import CarvingOcclusion, ContainerOcclusion
 from splashbench.scene.camera import Camera, look_at
 from splashbench.scene.container import ContainerMesh
 from splashbench_methods.splashsplat.carriers.visibility import seen_by_any
-from splashbench_methods.splashsplat.fields.gravity_cues import GravityCues, gravity_cues
+from splashbench_methods.splashsplat.fields.gravity_cues import GravityCues, falling_jets, gravity_cues
 from splashbench_methods.splashsplat.fields.jet import Jet
 from splashbench_methods.splashsplat.fields.pool import LiquidPool
 from splashbench_methods.splashsplat.fields.vessel import Vessel, upright
@@ -271,8 +271,10 @@ def test_carriers_land_on_the_pool_and_on_the_walls(poured):
     container = ContainerOcclusion(poured.mesh, DOWN)
     bounds = sequence_bounds(silhouettes, container).padded(0.1)
     depths = [depth_image(poured.mesh, camera) for camera in silhouettes.cameras]
-    known = gravity_cues(silhouettes, silhouettes, bounds, container, DOWN, None, np.arange(2.0), depths)
-    assert known.jets == [None, None]
+    falling = falling_jets(silhouettes, silhouettes, bounds, container, DOWN, None, np.arange(2.0))
+    assert falling.jets == [None, None]
+    assert not falling.scaled
+    known = gravity_cues(silhouettes, container, DOWN, depths, falling=falling)
     grid = Grid.over(Bounds(np.full(3, -0.2), np.full(3, 0.2)), 80)
     start = grid.to_voxels(np.array([[0, 0.15, 0], [0, 0.03, 0], [0, 0.15, 0], [0, 0.15, 0]]))
     end = grid.to_voxels(np.array([[0.01, -0.05, 0], [0, 0.02, 0], [0.15, 0.07, 0], [0.15, 0.15, 0]]))
