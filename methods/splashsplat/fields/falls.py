@@ -16,6 +16,8 @@ import numpy as np
 
 # Standard deviation of the height of a tip or tail, voxels.
 _END = 2.0
+# Nothing that falls freely slows down to this share of its speed: the end is another drop's then.
+_SLOWED = 0.7
 # What an error costs at the most: three standard deviations.
 MOST = 9.0
 # Free falls through all that is seen that are tried: how many, and how long they last, from this share of the shortest
@@ -92,14 +94,17 @@ def _end(heights: np.ndarray, which: int) -> float:
 def _runs(ends: Sequence[float], times: np.ndarray, voxel: float, bottom: float, top: float) -> Iterator[np.ndarray]:
     """What of `ends`, a height a frame, falls freely between `bottom` and `top`."""
     run: list[tuple[float, float]] = []
+    speed = 0.0
     for end, time in zip([*ends, np.nan], [*times, np.nan]):
         free = bottom + 2 * voxel < end < top - 2 * voxel
-        if run and not (free and end < run[-1][1] - voxel):
+        now = (run[-1][1] - end) / (time - run[-1][0]) if run and free else 0.0
+        if run and not (free and end < run[-1][1] - voxel and now > _SLOWED * speed):
             if len(run) >= 2:
                 yield np.array(run)
-            run = []
+            run, now = [], 0.0
         if free:
             run.append((float(time), float(end)))
+            speed = now
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,6 +85,9 @@ def test_first_drops_are_followed_to_the_ground_where_it_is_seen() -> None:
     assert Ends.of(heights, times, VOXEL, TOP, BOTTOM + 0.02).runs == []
     (run,) = Ends.of(heights, times, VOXEL, TOP, BOTTOM + 0.02, [0.22, 0.14, 0.03, 0.0, 0.0]).runs
     np.testing.assert_allclose(run, [[0.0, 0.22], [0.04, 0.14], [0.08, 0.03]])
+    # A drop that lags behind is no end of the jet's.
+    (run,) = Ends.of(heights, times, VOXEL, TOP, BOTTOM + 0.02, [0.22, 0.14, 0.11, 0.0, 0.0]).runs
+    np.testing.assert_allclose(run, [[0.0, 0.22], [0.04, 0.14]])
     # Where there is no liquid yet, none falls; and what rises does not.
     lowest = [np.inf, 0.2, 0.1, 0.15, 0.0]
     (run,) = Ends.of(heights, times, VOXEL, TOP, BOTTOM + 0.02, lowest).runs
