@@ -362,3 +362,32 @@ def test_without_masks_the_page_says_what_was_run() -> None:
         for metric, figure in zip(metrics, cell.split("/"), strict=True):
             mean = statistics.mean(float(runs[name, masks][metric]) for name in names)
             assert float(figure) == pytest.approx(mean, abs=0.501 * 10 ** -len(figure.strip().split(".")[1]))
+
+
+def test_version_37_is_what_was_measured() -> None:
+    with (RESULTS / "data" / "version_37.csv").open(encoding="utf-8", newline="") as file:
+        measured = {
+            (row["scene"], row["preset"], row["withheld"], row["version"], row["metric"]): float(row["value"])
+            for row in csv.DictReader(file)
+            if row["seed"] == "0"
+        }
+    page = (RESULTS / "history.md").read_text(encoding="utf-8")
+    section = page[page.index("## Version 37") : page.index("## Version 36")]
+    metrics = (("psnr", 2), ("lpips", 4), ("miou", 3), ("jitter_error", 4), ("velocity_epe_relative", 2))
+    new = {"thin_stream, poured": "stream_25", "glass_tank, amber": "amber_33", "clear_liquid, blue": "clear_20"}
+    seen = 0
+    for header, preset, withheld in (
+        ("| `best`, every timestep", "best", ""),
+        ("| `quick`, fitted to every second", "quick", "odd"),
+        ("| `quick`, scenes on which", "quick", ""),
+    ):
+        for line in section[section.index(header) :].split("\n\n")[0].splitlines()[2:]:
+            name, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+            scene = next((short for label, short in new.items() if name.startswith(label)), name)
+            for (metric, digits), cell in zip(metrics, cells):
+                figures = [float(figure) for figure in cell.replace("*", "").split(" → ")]
+                for version, figure in zip(("36", "37"), figures * (3 - len(figures)), strict=True):
+                    value = measured[scene, preset, withheld, version, metric]
+                    assert figure == pytest.approx(value, abs=0.51 * 10**-digits), (line, metric)
+                    seen += 1
+    assert seen == 5 * 10 + 5 * 8 + 3 * 10

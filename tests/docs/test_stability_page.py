@@ -237,3 +237,17 @@ def test_what_version_36_keeps_of_turned_rigs_is_what_was_run() -> None:
         size = float(amount.split()[0])
         for (scene, version), cell in zip(((BOWL, 24), (BOWL, 36), (TANK, 26), (TANK, 36)), cells, strict=True):
             holds(cell.replace("*", ""), kept.retention, scene, version, kind.strip("`"), size)
+
+
+def test_what_version_37_changes_is_what_was_run() -> None:
+    measured = pd.read_csv(RESULTS / "data" / "stability_version_37.csv").set_index(
+        ["kind", "amount", "metric", "version"]
+    )
+    kind = ""
+    for name, amounts, before, after in rows("| opaque_bowl, mIoU / PSNR in dB |"):
+        kind = name.strip("`") or kind
+        sizes = [float(number) for number in re.findall(r"[\d.]+", amounts)]
+        for version, cell in ((36, before), (37, before if after == "the same" else after)):
+            for size, pair in zip(sizes, cell.replace("*", "").split(", "), strict=True):
+                for metric, figure, within in zip(("miou", "psnr"), pair.split("/"), (5.1e-4, 0.0051), strict=True):
+                    assert float(figure) == pytest.approx(measured.value[kind, size, metric, version], abs=within)
