@@ -77,13 +77,17 @@ class Ends:
 
     def misfit(self, fall: FreeFall) -> float:
         """Squared errors of the ends' fall, over _END voxels; each run starts when it likes."""
-        cost = 0.0
+        return float(self.misfits(fall.top, np.array([fall.speed]), np.array([fall.gravity]))[0])
+
+    def misfits(self, top: float, speed: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        """`misfit` of the falls that pass `top` at each `speed` [F] where `gravity` [F] is so strong: [F]."""
+        cost = np.zeros(len(speed))
+        v, g = speed[:, None], gravity[:, None]
         for run in self.runs:
-            fallen = fall.lasted(run[:, 1])
-            lasted = np.maximum(run[:, 0] - np.median(run[:, 0] - fallen), 0)
-            way = fall.speed * lasted + 0.5 * fall.gravity * lasted**2
-            error = (fall.top - way - run[:, 1]) / (_END * self.voxel)
-            cost += float(np.minimum(error**2, MOST).sum())
+            fallen = (np.sqrt(np.maximum(v**2 + 2 * g * (top - run[:, 1]), 0)) - v) / g
+            lasted = np.maximum(run[:, 0] - np.median(run[:, 0] - fallen, axis=1, keepdims=True), 0)
+            error = (top - v * lasted - 0.5 * g * lasted**2 - run[:, 1]) / (_END * self.voxel)
+            cost += np.minimum(error**2, MOST).sum(axis=1)
         return cost
 
 
@@ -128,8 +132,8 @@ class Unscaled:
             # Of a fall through all that is seen: at a speed of 1 it would last so long, and gravity be `shape`.
             lasts = float(FreeFall(top, 1.0, float(shape)).lasted(np.array(bottom)))
             falls.append([FreeFall(top, 1.0, float(shape)).faster(lasts / float(duration)) for duration in durations])
-        fallen = np.array([[ends.misfit(fall) for fall in row] for row in falls])
-        return cls(falls, costs[:, None] + fallen)
+        speed, gravity = np.array([[(fall.speed, fall.gravity) for fall in row] for row in falls]).reshape(-1, 2).T
+        return cls(falls, costs[:, None] + ends.misfits(top, speed, gravity).reshape(len(shapes), -1))
 
     @property
     def known(self) -> bool:
