@@ -391,3 +391,14 @@ def test_version_37_is_what_was_measured() -> None:
                     assert figure == pytest.approx(value, abs=0.51 * 10**-digits), (line, metric)
                     seen += 1
     assert seen == 5 * 10 + 5 * 8 + 3 * 10
+
+
+def test_states_of_version_37_are_what_was_measured() -> None:
+    with (RESULTS / "data" / "whole_fit_version_37.csv").open(encoding="utf-8", newline="") as file:
+        *_, end = csv.DictReader(file)
+    page = (RESULTS / "whole_fit.md").read_text(encoding="utf-8")
+    said = re.search(r"falls\*\*: (\S+) dB and (\S+) at its end.*?its\s+(\d+) s say", page, re.DOTALL)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(float(end["psnr"]), abs=0.0051)
+    assert float(said[2]) == pytest.approx(float(end["miou"]), abs=5.1e-4)
+    assert float(said[3]) == pytest.approx(float(end["seconds"]), abs=0.51)

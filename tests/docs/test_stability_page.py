@@ -251,3 +251,21 @@ def test_what_version_37_changes_is_what_was_run() -> None:
             for size, pair in zip(sizes, cell.replace("*", "").split(", "), strict=True):
                 for metric, figure, within in zip(("miou", "psnr"), pair.split("/"), (5.1e-4, 0.0051), strict=True):
                     assert float(figure) == pytest.approx(measured.value[kind, size, metric, version], abs=within)
+
+
+def test_what_version_37_hardly_touches_is_what_was_run() -> None:
+    runs = pd.read_csv(RESULTS / "data" / "stability_version_37.csv")
+    few = runs.groupby("kind").severity.nunique() == 1
+    value = runs[runs.kind.isin(few[few].index)].set_index(["kind", "metric", "version"]).value.unstack()
+    said = re.search(
+        r"of (\w+) more kinds at the fifth.*?mIoU differs by (\S+) \(`(\w+)`\) to (\S+) \(`(\w+)`\), "
+        r"PSNR by (\S+) to (\S+) dB",
+        PAGE,
+    )
+    assert said is not None
+    assert said[1] == "thirteen"
+    assert int(few.sum()) == 13
+    change = (value[37] - value[36]).unstack()
+    assert (change.miou.idxmin(), change.miou.idxmax()) == (said[3], said[5])
+    assert [float(said[n]) for n in (2, 4)] == pytest.approx([change.miou.min(), change.miou.max()], abs=5.1e-4)
+    assert [float(said[n]) for n in (6, 7)] == pytest.approx([change.psnr.min(), change.psnr.max()], abs=0.0051)
