@@ -61,8 +61,8 @@ class GravityCues:
     def jet_floor(self, t: int) -> float:
         """Height down to which the jet of frame `t` flies freely: to the pool, or to the wall that its axis meets.
 
-        Where nobody sees how high the pool stands, it stands no higher than when it is seen next, as it fills up.
-        Where it never is, or there is no vessel, a jet flies down to where the jets were found.
+        Where nobody sees how high the pool stands, it stands no higher than when it is seen next, as it fills up; where
+        it is not seen any more, it is taken for empty. Without a vessel a jet flies down to where jets were found.
         """
         known = self.levels[t:][np.isfinite(self.levels[t:])]
         if len(known):
