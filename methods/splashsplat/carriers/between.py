@@ -4,8 +4,8 @@ Each frame's carriers are moved to the time, forwards or backwards, and count by
 frame's own time the other's are gone, and they come and go without a kink there: slow motion does not pulse with the
 frames. Three rules say which are moved and how opaque they are.
 
-- Where the liquid keeps its place, as a pool or a steady jet does, carriers stay. What they show keeps its place too:
-  a jet flows on, and the light on it does not.
+- Where the liquid keeps its place, as a pool does, carriers stay. What they show keeps its place too. So do those of a
+  steady jet whose fall is not known; where it is, they flow.
 - What is liquid before and after is liquid in between. Where carriers have moved on and none has come, they stay.
 - A carrier is as opaque as its way is near to the liquid: phi is followed along the way, since a drop that moves by
   more than its size is far from both frames' surfaces half way. What gets to where no liquid is fades as it goes.

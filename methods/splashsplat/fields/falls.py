@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# Of fewer slices nothing is taken for a jet.
+SLICES_AT_LEAST = 8
 # Standard deviation of the height of a tip or tail, voxels.
 _END = 2.0
 # Nothing that falls freely slows down to this share of its speed: the end is another drop's then.
@@ -68,11 +70,16 @@ class Ends:
     ) -> Ends:
         """heights: of the slices of each frame, ascending, which lie between `bottom` and `top`. lowest: of all liquid
         in each frame, infinite for none, where it is seen down to the ground; without it first drops are followed down
-        to `bottom`."""
+        to `bottom`.
+
+        Before the first drop there is no jet, and none after the last: what else goes up and down are masks."""
         ground = bottom if lowest is None else min(lowest)
         first = [_end(height, 0) for height in heights] if lowest is None else lowest
         last = [_end(height, -1) for height in heights]
-        runs = [*_runs(first, times, voxel, ground, top), *_runs(last, times, voxel, bottom, top)]
+        # Also before the first frame, and after the last.
+        none = [True, *(len(height) < SLICES_AT_LEAST for height in heights), True]
+        runs = [run for start, run in _runs(first, times, voxel, ground, top) if none[start]]
+        runs += [run for start, run in _runs(last, times, voxel, bottom, top) if none[start + len(run) + 1]]
         return cls(runs, voxel)
 
     def misfit(self, fall: FreeFall) -> float:
@@ -95,16 +102,18 @@ def _end(heights: np.ndarray, which: int) -> float:
     return float(heights[which]) if len(heights) else np.nan
 
 
-def _runs(ends: Sequence[float], times: np.ndarray, voxel: float, bottom: float, top: float) -> Iterator[np.ndarray]:
-    """What of `ends`, a height a frame, falls freely between `bottom` and `top`."""
+def _runs(
+    ends: Sequence[float], times: np.ndarray, voxel: float, bottom: float, top: float
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Runs of `ends`, a height a frame, that fall freely from `top` to `bottom`, and each one's first frame."""
     run: list[tuple[float, float]] = []
     speed = 0.0
-    for end, time in zip([*ends, np.nan], [*times, np.nan]):
+    for number, (end, time) in enumerate(zip([*ends, np.nan], [*times, np.nan])):
         free = bottom + 2 * voxel < end < top - 2 * voxel
         now = (run[-1][1] - end) / (time - run[-1][0]) if run and free else 0.0
         if run and not (free and end < run[-1][1] - voxel and now > _SLOWED * speed):
             if len(run) >= 2:
-                yield np.array(run)
+                yield number - len(run), np.array(run)
             run, now = [], 0.0
         if free:
             run.append((float(time), float(end)))
@@ -113,42 +122,48 @@ def _runs(ends: Sequence[float], times: np.ndarray, voxel: float, bottom: float,
 
 @dataclass(frozen=True, eq=False)
 class Unscaled:
-    """Free falls where gravity is not known. falls: [S][L], of S shapes and L durations each. cost: [S, L],
-    how badly they explain shape and ends."""
+    """Falls through all that is seen where gravity is not known, of S shapes and L durations each.
 
-    falls: list[list[FreeFall]]
+    top: their height. shape: [S], gravity over the square of the speed at the top, 1 / scene units. lasts: [S], seconds
+    for which each would last at a speed of 1. duration: [L], seconds, ascending. cost: [S, L], how badly they explain
+    shape and ends.
+    """
+
+    top: float
+    shape: np.ndarray
+    lasts: np.ndarray
+    duration: np.ndarray
     cost: np.ndarray
 
     @classmethod
     def of(
-        cls, shapes: np.ndarray, costs: np.ndarray, ends: Ends, times: np.ndarray, top: float, bottom: float
+        cls, shape: np.ndarray, cost: np.ndarray, ends: Ends, times: np.ndarray, top: float, bottom: float
     ) -> Unscaled:
-        """shapes: [S] of gravity over the square of the speed at the top, 1 / scene units; costs: [S], how badly these
-        explain what a jet looks like."""
-        steps = np.diff(times)
-        durations = np.geomspace(_SHORTEST * steps.min(), _LONGEST * (times[-1] - times[0]), _LASTED)
-        falls = []
-        for shape in shapes:
-            # Of a fall through all that is seen: at a speed of 1 it would last so long, and gravity be `shape`.
-            lasts = float(FreeFall(top, 1.0, float(shape)).lasted(np.array(bottom)))
-            falls.append([FreeFall(top, 1.0, float(shape)).faster(lasts / float(duration)) for duration in durations])
-        speed, gravity = np.array([[(fall.speed, fall.gravity) for fall in row] for row in falls]).reshape(-1, 2).T
-        return cls(falls, costs[:, None] + ends.misfits(top, speed, gravity).reshape(len(shapes), -1))
+        """cost: [S], how badly each `shape` explains what a jet looks like, which falls from `top` to `bottom`."""
+        duration = np.geomspace(_SHORTEST * np.diff(times).min(), _LONGEST * (times[-1] - times[0]), _LASTED)
+        lasts = np.array([float(FreeFall(top, 1.0, float(one)).lasted(np.array(bottom))) for one in shape])
+        speed = lasts[:, None] / duration
+        fallen = ends.misfits(top, speed.ravel(), (shape[:, None] * speed**2).ravel())
+        return cls(top, shape, lasts, duration, cost[:, None] + fallen.reshape(speed.shape))
 
     @property
     def known(self) -> bool:
         """Whether the ends tell how long a fall lasts."""
-        by_duration = self.cost.min(axis=0)
-        as_good = np.flatnonzero(by_duration < by_duration.min() + _AS_MUCH)
-        lasts = [self.falls[0][n].speed for n in (as_good[-1], as_good[0])]  # the shorter, the faster
-        within = as_good[0] > 0 and as_good[-1] < self.cost.shape[1] - 1
-        return bool(within and lasts[1] <= _KNOWN * lasts[0])
+        best = self.cost.min(axis=0)
+        as_good = np.flatnonzero(best < best.min() + _AS_MUCH)
+        shortest, longest = as_good[0], as_good[-1]
+        within = shortest > 0 and longest < len(self.duration) - 1
+        return bool(within and self.duration[longest] <= _KNOWN * self.duration[shortest])
 
     def best(self) -> FreeFall:
         """The fall that explains most."""
-        shape, duration = np.unravel_index(int(self.cost.argmin()), self.cost.shape)
-        return self.falls[shape][duration]
+        return self._fall(int(self.cost.argmin()))
 
     def as_good(self) -> list[FreeFall]:
         """Those that explain as much."""
-        return [self.falls[s][d] for s, d in np.argwhere(self.cost < self.cost.min() + _AS_MUCH)]
+        return [self._fall(int(n)) for n in np.flatnonzero(self.cost < self.cost.min() + _AS_MUCH)]
+
+    def _fall(self, number: int) -> FreeFall:
+        shape, duration = divmod(number, len(self.duration))
+        faster = float(self.lasts[shape] / self.duration[duration])
+        return FreeFall(self.top, 1.0, float(self.shape[shape])).faster(faster)

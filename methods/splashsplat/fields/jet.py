@@ -1,4 +1,5 @@
-"""The speed of a falling jet from its shape: liquid in the air falls freely, and gravity is known.
+"""The speed of a falling jet from its shape: liquid in the air falls freely. Where nobody told how strong gravity is,
+its ends tell both (falls.py).
 
 The hull's surface says little of how fast a steady stream runs through it: nothing visible moves. Its shape does. In
 free fall the path of a steady jet bends by g / (2 v_h^2), and its level cross-section thins as 1 / vertical speed. Its
@@ -19,15 +20,14 @@ import numpy as np
 
 from splashbench.scene.camera import Camera
 
-from .falls import MOST, Ends, FreeFall, Unscaled
+from .falls import MOST, SLICES_AT_LEAST, Ends, FreeFall, Unscaled
 
 STANDARD_GRAVITY = 9.81  # m/s^2
-# What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, of its radius
-# (voxels).
+# What the cues are worth: standard deviations of a slice's middle (voxels), of the logarithm of its area, and of its
+# radius (voxels).
 _MIDDLE, _AREA, _RADIUS = 0.1, 0.2, 0.5
 # Neighbouring slices err alike: so many of them count as one.
 _ALIKE = 4
-_SLICES_AT_LEAST = 8
 # Slices are no jet's where their middles lie off its axis by this many voxels, or the logarithm of what passes through
 # them differs by so much, in the median.
 _ASTRAY, _UNEVEN = 0.5, 0.3
@@ -93,7 +93,7 @@ def open_floor(frames: Sequence[Slices], voxel: float) -> float:
     Going down from the top, the stream ends where the usual cross-section is several times what it was above.
     """
     usual = _merged(list(frames), voxel)
-    for n in range(len(usual.height) - _SLICES_AT_LEAST, -1, -1):
+    for n in range(len(usual.height) - SLICES_AT_LEAST, -1, -1):
         if usual.area[n] > _BODY * np.median(usual.area[n + 1 :]):
             return float(usual.height[n] + 2 * voxel)
     return float(usual.height[0]) if len(usual.height) else float("inf")
@@ -173,7 +173,7 @@ def fit_jets(
     fall. voxel: scene units. lowest: see `Ends.of`.
     """
     groups = [_merged(frames[start : start + _STEADY], voxel) for start in range(0, len(frames), _STEADY)]
-    used = [number for number, group in enumerate(groups) if len(group.height) >= _SLICES_AT_LEAST]
+    used = [number for number, group in enumerate(groups) if len(group.height) >= SLICES_AT_LEAST]
     if not used:
         return [None] * len(frames)
     streams = [groups[number] for number in used]
@@ -222,9 +222,8 @@ def _unscaled_fall(
     """`_fall` where gravity is not known; None where the ends do not tell how fast they fall."""
     if not ends.runs:
         return None
-    # Those of the speeds that are tried where gravity is known.
-    fastest = 1 / (2 * _FASTEST**2 * (top - bottom + voxel))
-    shapes = fastest * np.geomspace(1, 300**2, _SPEEDS)
+    # Those of the speeds that are tried where gravity is known, from the straightest on.
+    shapes = np.geomspace(1, 300**2, _SPEEDS) / (2 * _FASTEST**2 * (top - bottom + voxel))
     costs = np.array([_explained(streams, FreeFall(top, 1.0, float(shape)), voxel)[0] for shape in shapes])
     tried = Unscaled.of(shapes, costs, ends, times, top, bottom)
     if not tried.known:
@@ -332,7 +331,7 @@ class _Beads:
         for t in range(len(self.times) - 1):
             now, then = self.thickness[t + 1], self.thickness[t]
             wet, was = np.isfinite(now), np.isfinite(then)
-            if min(wet.sum(), was.sum()) < _SLICES_AT_LEAST:
+            if min(wet.sum(), was.sum()) < SLICES_AT_LEAST:
                 continue
             from_where = fallen[wet] + (self.times[t + 1] - self.times[t])
             expected = np.interp(from_where, fallen[was], then[was], left=np.nan, right=np.nan)

@@ -58,6 +58,16 @@ def test_a_steady_jet_may_be_slow_or_fast() -> None:
     assert fit_jets(steady, TIMES, 9.81, VOXEL) != [None] * len(TIMES)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_masks_that_flicker_at_the_ends_of_a_steady_jet_are_no_drops(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    flickering = []
+    for frame, low, high in zip(poured(FreeFall(TOP, 1.0, 9.81), TIMES, None, None), *rng.integers(0, 15, (2, 40))):
+        kept = slice(low, len(frame.height) - high)
+        flickering.append(Slices(frame.height[kept], frame.middle[kept], frame.area[kept]))
+    assert fit_jets(flickering, TIMES, None, VOXEL) == [None] * len(TIMES)
+
+
 def test_ends_that_fall_between_two_frames_say_too_little() -> None:
     """Half a second from frame to frame: no end is seen twice."""
     times = np.arange(10) * 0.5
